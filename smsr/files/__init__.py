@@ -1,0 +1,1 @@
+"""Reading measurement, ground-truth and face files; writing results."""

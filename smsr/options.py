@@ -1,0 +1,181 @@
+"""Options as data: one dataclass says type, default, range and help of each.
+
+The command line, the HTTP service and its page all build on `describe` and `parse`; nothing about
+an option is written twice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+from smsr.errors import InvalidOption, UnknownOption
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+T = TypeVar("T")
+
+
+def option(
+    default: T,
+    help: str,  # noqa: A002  (the word users know)
+    *,
+    minimum: float | None = None,
+    maximum: float | None = None,
+) -> T:
+    """Return a dataclass field with its help and its inclusive range.
+
+    Parameters
+    ----------
+    default : object
+        Value when the caller gives none.
+    help : str
+        One or two plain sentences.
+    minimum, maximum : float, optional
+        Inclusive bounds of a number.
+    """
+    metadata = {"help": help, "minimum": minimum, "maximum": maximum}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """Options of `smsr.reconstruct`."""
+
+    preset: Literal["default", "paper"] = option(
+        "default",
+        "Stages and constants: 'default' is what measures best, 'paper' follows the publication.",
+    )
+    layout: Literal["auto", "interleaved", "stacked"] = option(
+        "auto",
+        "Row order of a 2-D measurement matrix: interleaved is u1, v1, u2, v2, ...; stacked is all "
+        "u rows, then all v rows. 'auto' takes a 2-D matrix as interleaved and recognises "
+        "(T, 2, N) and (T, N, 2) arrays.",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OptionDescription:
+    """What a person or a form needs to know about one option."""
+
+    name: str
+    type: Literal["integer", "number", "boolean", "string"]
+    default: int | float | bool | str | None
+    help: str
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] | None = None
+    nullable: bool = False
+
+
+_TYPE_NAMES: dict[type, Literal["integer", "number", "boolean", "string"]] = {
+    int: "integer",
+    float: "number",
+    bool: "boolean",
+    str: "string",
+}
+
+
+def describe(cls: type) -> tuple[OptionDescription, ...]:
+    """Describe every option of an options dataclass, in order of definition."""
+    hints = typing.get_type_hints(cls)
+    descriptions = []
+    for field in dataclasses.fields(cls):
+        hint = hints[field.name]
+        nullable = False
+        if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+            members = [m for m in typing.get_args(hint) if m is not types.NoneType]
+            nullable = len(members) < len(typing.get_args(hint))
+            (hint,) = members
+        choices: tuple[str, ...] | None = None
+        if typing.get_origin(hint) is Literal:
+            choices = typing.get_args(hint)
+            hint = str
+        descriptions.append(
+            OptionDescription(
+                name=field.name,
+                type=_TYPE_NAMES[hint],
+                default=typing.cast("int | float | bool | str | None", field.default),
+                help=field.metadata["help"],
+                minimum=field.metadata["minimum"],
+                maximum=field.metadata["maximum"],
+                choices=choices,
+                nullable=nullable,
+            )
+        )
+    return tuple(descriptions)
+
+
+O = TypeVar("O")  # noqa: E741  (an options dataclass)
+
+
+def parse(cls: type[O], values: Mapping[str, object]) -> O:
+    """Build an options dataclass from names and values, checking each.
+
+    Parameters
+    ----------
+    cls : type
+        An options dataclass whose fields are made by `option`.
+    values : mapping
+        Names to values, as from JSON. Integers pass for numbers; nothing else is converted.
+
+    Raises
+    ------
+    UnknownOption
+        A name that is no option; near names are suggested.
+    InvalidOption
+        A value of the wrong type, out of range, or no allowed choice.
+    """
+    known = {d.name: d for d in describe(cls)}
+    checked: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            raise UnknownOption(
+                f"There is no option {name!r}.{hint} Options are {', '.join(known)}.",
+                option=name,
+                options=list(known),
+            )
+        checked[name] = _check(known[name], value)
+    return cls(**checked)
+
+
+def _check(what: OptionDescription, value: object) -> int | float | bool | str | None:
+    if value is None and what.nullable:
+        return None
+    match what.type:
+        case "boolean":
+            fits = isinstance(value, bool)
+        case "integer":
+            fits = isinstance(value, int) and not isinstance(value, bool)
+        case "number":
+            fits = isinstance(value, int | float) and not isinstance(value, bool)
+            fits = fits and math.isfinite(typing.cast("float", value))
+        case "string":
+            fits = isinstance(value, str)
+    if not fits:
+        raise _invalid(what, value, f"must be of type {what.type}{' or null' * what.nullable}")
+    if what.choices is not None and value not in what.choices:
+        raise _invalid(what, value, f"must be one of {', '.join(what.choices)}")
+    if what.type in ("integer", "number"):
+        number = typing.cast("float", value)
+        low = -math.inf if what.minimum is None else what.minimum
+        high = math.inf if what.maximum is None else what.maximum
+        if not low <= number <= high:
+            raise _invalid(what, value, f"must be between {low:g} and {high:g}")
+        if what.type == "number":
+            return float(number)
+    return typing.cast("int | float | bool | str", value)
+
+
+def _invalid(what: OptionDescription, value: object, rule: str) -> InvalidOption:
+    shown = repr(value)
+    shown = shown if len(shown) <= 60 else shown[:57] + "..."
+    return InvalidOption(f"Option {what.name!r} {rule}; it was {shown}.", option=what.name)

@@ -1,0 +1,34 @@
+"""How a run reports: a stage, a fraction, an iteration and a residual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """One report of a running reconstruction.
+
+    Attributes
+    ----------
+    stage : str
+        Name of the stage, one of `smsr.pipeline.STAGES`.
+    fraction : float
+        Part of the whole run that is done, 0 to 1, never decreasing within a run.
+    iteration : int
+        Iteration within the stage, 0 where the stage has none.
+    residual : float or None
+        The stage's own stopping residual, None where it has none yet.
+    """
+
+    stage: str
+    fraction: float
+    iteration: int = 0
+    residual: float | None = None
+
+
+ProgressCallback: TypeAlias = Callable[[Progress], object]
+"""Called with each report. Returning exactly ``False`` cancels the run (`smsr.Cancelled` is raised
+by the solver); an exception it raises passes through unchanged."""

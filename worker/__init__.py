@@ -1,0 +1,1 @@
+"""The queue contract: job records, object storage and the task that RQ runs."""
