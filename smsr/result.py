@@ -132,4 +132,5 @@ class Reconstruction:
     def in_camera_frame(self) -> NDArray[np.floating[Any]]:
         """Return the shapes (T, N, 3) turned into the camera frame of each frame, R3_t S_t."""
         rotations = self.rotations.astype(self.shapes.dtype)
-        return np.matmul(self.shapes, rotations.transpose(0, 2, 1))
+        turned: NDArray[np.floating[Any]] = self.shapes @ rotations.transpose(0, 2, 1)
+        return turned
