@@ -1,0 +1,36 @@
+# Each target calls the script of its name in scripts/, which makes .venv and installs what is missing.
+.PHONY: help install demo test lint format benchmark pictures clean
+
+help:
+	@echo "make demo       run the whole service on a generated example; results in demo-output/"
+	@echo "make test       run every test"
+	@echo "make lint       style, format and types (make format mends what it can)"
+	@echo "make benchmark  the accuracy table, on the data in SMSR_DATA or ../shared/data"
+	@echo "make pictures   draw the pictures of the documentation again"
+	@echo "make install    only the virtual environment in .venv"
+	@echo "make clean      remove .venv and everything generated"
+
+install:
+	@scripts/install
+
+demo:
+	@scripts/demo
+
+test:
+	@scripts/test
+
+lint:
+	@scripts/check
+
+format:
+	@scripts/check --fix
+
+benchmark:
+	@scripts/benchmark
+
+pictures:
+	@scripts/install dev
+	@.venv/bin/python scripts/make_pictures.py
+
+clean:
+	rm -rf .venv demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
