@@ -1,8 +1,8 @@
 """Published figures of other methods and of the paper itself: its Table 1.
 
 The paper is Ansari, Golyanik and Stricker, "Scalable Dense Monocular Surface Reconstruction", 3DV
-2017. All are e3D (Eq. 24, with the Euclidean distance) after one orthogonal alignment of the sequence.
-Those of dinosaur compare in the camera frame, where its ground truth does not sit.
+2017. All are e3D (Eq. 24, with the Euclidean distance) after one orthogonal alignment of the whole
+sequence. Those of dinosaur compare in the camera frame, where its ground truth does not sit.
 """
 
 from __future__ import annotations
