@@ -58,6 +58,67 @@ class Options:
         "u rows, then all v rows. 'auto' takes a 2-D matrix as interleaved and recognises "
         "(T, 2, N) and (T, N, 2) arrays.",
     )
+    virtual_points: int = option(
+        64,
+        "Number of virtual points the measurements are reduced to before solving. The largest "
+        "singular directions are kept; what they do not span gets zero depth.",
+        minimum=4,
+        maximum=4096,
+    )
+    camera_model: Literal["auto", "relaxed", "uniform", "paper"] = option(
+        "auto",
+        "How cameras are found: 'relaxed' by a convex problem, 'uniform' as a turn of constant "
+        "velocity, 'paper' by rank-3 thresholding; 'auto' as the preset says.",
+    )
+    basis_size: int | None = option(
+        None,
+        "Largest number K of basis shapes in the camera stage; null lets the method choose.",
+        minimum=1,
+        maximum=30,
+    )
+    camera_iterations: int = option(
+        600, "Most iterations of the camera stage.", minimum=1, maximum=100_000
+    )
+    camera_tolerance: float = option(
+        1e-7, "Relative change at which the camera stage stops.", minimum=1e-15, maximum=1.0
+    )
+    smoothing: bool | None = option(
+        None,
+        "Smooth the trajectories of the points before finding shapes; null as the preset says.",
+    )
+    smoothing_ratio: float = option(
+        0.1,
+        "Number of cosine basis functions of the smoothing stage, as a part of the frames.",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    smoothing_iterations: int = option(
+        30, "Most Gauss-Newton iterations of the smoothing stage.", minimum=1, maximum=10_000
+    )
+    shape_method: Literal["auto", "nuclear", "reweighted", "paper"] = option(
+        "auto",
+        "How shapes are found: 'nuclear' minimises the nuclear norm to convergence, 'reweighted' "
+        "a reweighted nuclear norm and the motion between frames, 'paper' uses the published "
+        "schedule; 'auto' as the preset and the camera model say.",
+    )
+    shape_iterations: int = option(
+        1000, "Most iterations of the shape stage.", minimum=1, maximum=100_000
+    )
+    shape_tolerance: float = option(
+        1e-4, "Relative residual at which the shape stage stops.", minimum=1e-15, maximum=1.0
+    )
+    penalty: float = option(
+        1.0,
+        "First penalty mu of the published shape stage, for measurements of unit variance.",
+        minimum=1e-6,
+        maximum=1e6,
+    )
+    penalty_growth: float = option(
+        1.02,
+        "Factor rho on the penalty in each iteration of the published shape stage.",
+        minimum=1.0,
+        maximum=10.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)

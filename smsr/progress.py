@@ -32,3 +32,12 @@ class Progress:
 ProgressCallback: TypeAlias = Callable[[Progress], object]
 """Called with each report. Returning exactly ``False`` cancels the run (`smsr.Cancelled` is raised
 by the solver); an exception it raises passes through unchanged."""
+
+
+StageHook: TypeAlias = Callable[[float, int, float | None], None]
+"""Called by a stage with the done part of the stage (0 to 1), the iteration and the residual. It
+may raise, `smsr.errors.Cancelled` for one, to stop the stage."""
+
+
+def ignore(fraction: float, iteration: int, residual: float | None) -> None:
+    """Take a stage's report and do nothing: the default hook."""

@@ -1,0 +1,81 @@
+"""Rotations and orthographic cameras as arrays.
+
+A camera R is 2 x 3 with orthonormal rows. Completed by the cross product of its rows, the viewing
+direction, it is a rotation G (3 x 3). Sequences are (T, 2, 3) and (T, 3, 3).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def complete(cameras: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Complete cameras (T, 2, 3) to rotations (T, 3, 3) by the viewing direction."""
+    depth = np.cross(cameras[:, 0], cameras[:, 1])
+    return np.concatenate([cameras, depth[:, None]], axis=1)
+
+
+def nearest_cameras(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cameras (T, 2, 3) with orthonormal rows nearest to any (T, 2, 3) array.
+
+    The polar factor of each frame; well defined by a deterministic choice even where the two rows
+    are parallel or zero.
+    """
+    left, _, right = np.linalg.svd(rows, full_matrices=False)
+    nearest: NDArray[np.float64] = left @ right
+    return nearest
+
+
+def exp(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations (T, 3, 3) of rotation vectors (T, 3) in radians."""
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
+
+
+def log(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation vectors (T, 3), of angle at most pi, of rotations (T, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())
+
+
+def left_jacobian(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return J (T, 3, 3) with ``exp(v + d) = exp(J d) exp(v)`` to first order in d."""
+    angle = np.linalg.norm(vectors, axis=1)
+    cross = np.zeros((len(vectors), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
+    cross -= cross.transpose(0, 2, 1)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    jacobian: NDArray[np.float64] = (
+        np.eye(3) + first[:, None, None] * cross + second[:, None, None] * (cross @ cross)
+    )
+    return jacobian
+
+
+def mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the chordal mean (3, 3) of rotations (T, 3, 3): the rotation nearest to their sum."""
+    left, _, right = np.linalg.svd(rotations.sum(axis=0))
+    left[:, 2] *= np.linalg.det(left @ right)
+    mean: NDArray[np.float64] = left @ right
+    return mean
+
+
+def angles_to(rotations: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angles (T,), radians, between rotations (T, 3, 3) and one rotation (3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations @ reference.T).magnitude())
+
+
+def mirror(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the cameras that see the shape mirrored in its depth at the identity camera.
+
+    An orthographic camera cannot tell ``R S`` from ``(R D)(D S)`` with D = diag(1, 1, -1); the
+    returned rotations (T, 3, 3) complete ``R D``.
+    """
+    flip = np.array([1.0, 1.0, -1.0])
+    return complete(rotations[:, :2] * flip)
