@@ -66,7 +66,9 @@ def mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     return mean
 
 
-def angles_to(rotations: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
+def angles_to(
+    rotations: NDArray[np.float64], reference: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the angles (T,), radians, between rotations (T, 3, 3) and one rotation (3, 3)."""
     return np.asarray(Rotation.from_matrix(rotations @ reference.T).magnitude())
 

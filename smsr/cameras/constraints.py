@@ -1,0 +1,136 @@
+"""Orthonormality of the cameras as a quadratic form that does not depend on the frames.
+
+With ``M'_t`` the two rows (m_u, m_v) of the scaled left singular vectors at frame t and F = Q Q^T,
+the rows of ``M'_t Q`` are orthonormal up to scale exactly if
+
+    m_u F m_u^T = m_v F m_v^T    and    m_u F m_v^T = 0                     (paper, Eqs. 5 to 8),
+
+linear in F. F is symmetric, so it is described by n (n + 1) / 2 coordinates, off-diagonal entries
+times sqrt(2), which keeps inner products: <F, G> = svec(F) . svec(G). All constraints of all
+frames are then one matrix ``A^T A`` of that size, built once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def symmetric_vector(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the coordinates (..., n (n + 1) / 2) of symmetric matrices (..., n, n)."""
+    rows, columns = np.triu_indices(F.shape[-1])
+    weights = np.where(rows == columns, 1.0, math.sqrt(2.0))
+    vector: NDArray[np.float64] = F[..., rows, columns] * weights
+    return vector
+
+
+def symmetric_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the symmetric matrix (n, n) of coordinates (n (n + 1) / 2,)."""
+    n = (math.isqrt(8 * len(vector) + 1) - 1) // 2
+    rows, columns = np.triu_indices(n)
+    F = np.zeros((n, n))
+    F[rows, columns] = vector * np.where(rows == columns, 1.0, math.sqrt(0.5))
+    F[columns, rows] = F[rows, columns]
+    return F
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OrthonormalityForm:
+    """The quadratic ``1/2 f^T H f - b^T f + c/2`` of f = svec(F).
+
+    Attributes
+    ----------
+    hessian : ndarray of shape (p, p), p = n (n + 1) / 2
+        H = A^T A.
+    linear : ndarray of shape (p,)
+        b, zero for the homogeneous constraints.
+    constant : float
+        c, the value of ``||A f - a||^2`` at f = 0.
+    lipschitz : float
+        Largest eigenvalue of H, the Lipschitz constant of the gradient.
+    """
+
+    hessian: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    constant: float
+    lipschitz: float
+
+    def gradient(self, f: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``H f - b``."""
+        gradient: NDArray[np.float64] = self.hessian @ f - self.linear
+        return gradient
+
+    def residual(self, f: NDArray[np.float64]) -> float:
+        """Return ``||A f - a||^2``, at least 0."""
+        return max(float(f @ (self.hessian @ f) - 2.0 * self.linear @ f) + self.constant, 0.0)
+
+
+def frame_products(
+    motion: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return svec of m_u m_u^T, m_v m_v^T and the symmetric part of m_u m_v^T, each (T, p).
+
+    Parameters
+    ----------
+    motion : ndarray of shape (2T, n)
+        M', rows u1, v1, u2, ...
+    """
+    u, v = motion[0::2], motion[1::2]
+    uu = symmetric_vector(u[:, :, None] * u[:, None, :])
+    vv = symmetric_vector(v[:, :, None] * v[:, None, :])
+    cross = u[:, :, None] * v[:, None, :]
+    uv = symmetric_vector(0.5 * (cross + cross.transpose(0, 2, 1)))
+    return uu, vv, uv
+
+
+_FRAMES_AT_ONCE = 512
+
+
+def orthonormality_form(motion: NDArray[np.float64], *, unit_scale: bool) -> OrthonormalityForm:
+    """Gather the orthonormality constraints of all frames.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (2T, n)
+        M', the scaled left singular vectors of the measurements.
+    unit_scale : bool
+        True asks for rows of unit length, ``m_u F m_u^T = m_v F m_v^T = 1``: one and the same
+        shape coefficient in every frame. False asks for rows of equal length only, as the paper
+        does (Eq. 8), and gives a homogeneous form.
+
+    Returns
+    -------
+    OrthonormalityForm
+        With the cross constraint counted twice, as the entries (u, v) and (v, u) of a Gram matrix.
+    """
+    n = motion.shape[1]
+    p = n * (n + 1) // 2
+    hessian = np.zeros((p, p))
+    linear = np.zeros(p)
+    constant = 0.0
+    for first in range(0, len(motion), 2 * _FRAMES_AT_ONCE):
+        uu, vv, uv = frame_products(motion[first : first + 2 * _FRAMES_AT_ONCE])
+        hessian += 2.0 * uv.T @ uv
+        if unit_scale:
+            hessian += uu.T @ uu + vv.T @ vv
+            linear += uu.sum(axis=0) + vv.sum(axis=0)
+            constant += 2.0 * len(uu)
+        else:
+            hessian += (uu - vv).T @ (uu - vv)
+    return OrthonormalityForm(hessian, linear, constant, _largest_eigenvalue(hessian))
+
+
+def _largest_eigenvalue(H: NDArray[np.float64]) -> float:
+    """Power iteration from a fixed start; 2 % above the estimate, so a safe step length."""
+    x = np.ones(len(H)) + np.arange(len(H)) / len(H)
+    value = 0.0
+    for _ in range(60):
+        x = H @ (x / max(float(np.linalg.norm(x)), 1e-300))
+        value = float(np.linalg.norm(x))
+    return 1.02 * value

@@ -1,0 +1,248 @@
+"""The reconstruction as a row of stages.
+
+Measurements are read and factored once; cameras and shapes are found on a few virtual points at a
+cost that does not depend on the number of points; the shapes of all points are written in one last
+pass.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from smsr.cameras import estimate_cameras, fix_gauge
+from smsr.errors import Cancelled
+from smsr.lifting import exact_lifting
+from smsr.measurements import as_source
+from smsr.options import Options, parse
+from smsr.progress import Progress
+from smsr.result import Caution, Diagnostics, Reconstruction, StageReport
+from smsr.rowspace import factorise, map_back
+from smsr.shapes import low_rank_shapes
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterator
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from smsr.lifting import Lifting
+    from smsr.measurements import MeasurementSource
+    from smsr.progress import ProgressCallback, StageHook
+    from smsr.rowspace import RowSpace
+
+STAGES = ("reading", "factorising", "cameras", "smoothing", "shapes", "writing")
+"""Names of the stages, in order."""
+
+_SHARES = dict(zip(STAGES, (0.02, 0.23, 0.25, 0.05, 0.20, 0.25), strict=True))
+"""Part of the progress bar that each stage moves."""
+
+_LISTED_RESIDUALS = 500
+_LISTED_SINGULAR_VALUES = 100
+
+
+def reconstruct(
+    measurements: ArrayLike | str | os.PathLike[str] | MeasurementSource,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    progress: ProgressCallback | None = None,
+    options: Options | None = None,
+    **option_values: Any,
+) -> Reconstruction:
+    """Reconstruct the moving 3D surface and the camera from 2D point tracks.
+
+    Parameters
+    ----------
+    measurements : ndarray, memmap, path or MeasurementSource
+        W: tracks of N points over T frames as (2T, N), rows u1, v1, u2, v2, ..., or any layout
+        that `smsr.options.Options.layout` names; a path of a file that `smsr.files` reads; or a
+        source of chunks.
+    out : path, optional
+        Folder, made where needed, that receives ``shapes.npy`` (T x N x 3, float32),
+        ``cameras.npy`` (T x 2 x 3, float64), ``translations.npy`` (T x 2, float64) and
+        ``report.json``. The shapes of the result are then a read-only memory map.
+    progress : callable, optional
+        Called with a `Progress` often. Returning ``False`` cancels the run.
+    options : Options, optional
+        All options at once.
+    **option_values
+        Single options by name, in place of those in `options`.
+
+    Returns
+    -------
+    Reconstruction
+        Shapes are float32 for float32 measurements or with `out`, float64 otherwise. The object
+        frame is that of the middle frame's camera, whose axes it shares.
+
+    Raises
+    ------
+    smsr.errors.InputError
+        The measurements or an option cannot be used; the subclass and the message say why.
+    smsr.errors.Cancelled
+        The progress callback returned ``False``.
+
+    Notes
+    -----
+    The method is M. D. Ansari, V. Golyanik, D. Stricker: Scalable Dense Monocular Surface
+    Reconstruction, 3DV 2017; `preset="paper"` follows it to the letter.
+    """
+    options = _merge(options, option_values)
+    clock = _Clock(progress)
+    with clock.stage("reading"):
+        source = as_source(measurements, options.layout)
+    with clock.stage("factorising") as hook:
+        space = factorise(source, progress=hook)
+    # The matrices of the solver are small: threads of BLAS cost more than they bring.
+    with threadpool_limits(limits=1, user_api="blas"):
+        solution = solve(space, options, clock)
+    with clock.stage("writing") as hook:
+        shapes = map_back(source, space, solution.lifting, out, progress=hook)
+    result = Reconstruction(
+        shapes=shapes,
+        cameras=solution.cameras,
+        translations=space.translations.copy(),
+        diagnostics=_diagnostics(options, space, solution, clock),
+    )
+    if out is not None:
+        _write_rest(result, Path(out))
+    return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Cameras, and the linear map that takes centred measurements to shapes."""
+
+    cameras: NDArray[np.float64]
+    lifting: Lifting
+    basis_size: int
+    camera_model: str
+    camera_reason: str
+    cautions: tuple[Caution, ...]
+
+
+def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
+    """Run the stages that do not depend on the number of points.
+
+    Parameters
+    ----------
+    space : RowSpace
+        The factored measurements.
+    options : Options
+        In force.
+    clock : _Clock
+        Receives the reports of the stages.
+    """
+    # Penalties have a fixed scale: solve for measurements of unit variance.
+    scale = math.sqrt((space.singular_values**2).sum() / (2 * space.frames * space.points))
+    kept = min(options.virtual_points, len(space.singular_values))
+    left, values = space.left[:, :kept], space.singular_values[:kept] / scale
+    with clock.stage("cameras") as hook:
+        estimate = estimate_cameras(left, values, options, hook)
+        rotations = fix_gauge(estimate.rotations)
+        clock.note(estimate.iterations, estimate.converged, estimate.reason, estimate.residuals)
+    with clock.stage("shapes") as hook:
+        found = low_rank_shapes(
+            left * values,
+            rotations,
+            max_iterations=options.shape_iterations,
+            tolerance=options.shape_tolerance,
+            hook=hook,
+        )
+        clock.note(found.iterations, found.converged, found.reason, found.residuals)
+    cameras = np.ascontiguousarray(rotations[:, :2])
+    return Solution(
+        cameras=cameras,
+        lifting=exact_lifting(found.shapes, cameras, left, values),
+        basis_size=estimate.basis_size,
+        camera_model=estimate.model,
+        camera_reason=estimate.reason,
+        cautions=(),
+    )
+
+
+class _Clock:
+    """Times the stages and turns their reports into those of the run."""
+
+    def __init__(self, callback: ProgressCallback | None) -> None:
+        self._callback = callback
+        self._done = 0.0
+        self.reports: list[StageReport] = []
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[StageHook]:
+        """Time a stage; the hook it gets reports and cancels."""
+        first = sum(_SHARES[before] for before in STAGES[: STAGES.index(name)])
+
+        def hook(fraction: float, iteration: int, residual: float | None) -> None:
+            self._report(name, first + min(fraction, 1.0) * _SHARES[name], iteration, residual)
+
+        hook(0.0, 0, None)
+        self.reports.append(StageReport(name, 0.0))
+        started = time.perf_counter()
+        yield hook
+        seconds = time.perf_counter() - started
+        self.reports[-1] = dataclasses.replace(self.reports[-1], seconds=seconds)
+        last = self.reports[-1]
+        hook(1.0, last.iterations, last.residuals[-1] if last.residuals else None)
+
+    def note(
+        self, iterations: int, converged: bool, reason: str, residuals: tuple[float, ...]
+    ) -> None:
+        """Add what the present stage did."""
+        step = -(-len(residuals) // _LISTED_RESIDUALS) or 1
+        self.reports[-1] = dataclasses.replace(
+            self.reports[-1],
+            iterations=iterations,
+            converged=converged,
+            reason=reason,
+            residuals=residuals[::-1][::step][::-1],
+        )
+
+    def _report(self, stage: str, fraction: float, iteration: int, residual: float | None) -> None:
+        self._done = max(self._done, min(fraction, 1.0))
+        if self._callback is None:
+            return
+        if self._callback(Progress(stage, self._done, iteration, residual)) is False:
+            raise Cancelled(f"The run was cancelled in stage {stage!r}.", stage=stage)
+
+
+def _merge(options: Options | None, values: dict[str, Any]) -> Options:
+    """Return the options given as one object and by name, checked."""
+    if options is None:
+        return parse(Options, values)
+    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Options)}
+    return parse(Options, given | values)
+
+
+def _diagnostics(
+    options: Options, space: RowSpace, solution: Solution, clock: _Clock
+) -> Diagnostics:
+    return Diagnostics(
+        options=options,
+        frames=space.frames,
+        points=space.points,
+        basis_size=solution.basis_size,
+        camera_model=solution.camera_model,
+        camera_reason=solution.camera_reason,
+        converged=all(report.converged for report in clock.reports),
+        stages=tuple(clock.reports),
+        singular_values=tuple(space.singular_values[:_LISTED_SINGULAR_VALUES].tolist()),
+        cautions=solution.cautions,
+    )
+
+
+def _write_rest(result: Reconstruction, folder: Path) -> None:
+    """Write everything but the shapes, the report last."""
+    np.save(folder / "cameras.npy", result.cameras)
+    np.save(folder / "translations.npy", result.translations)
+    text = json.dumps(result.diagnostics.to_dict(), indent=1)
+    (folder / "report.json").write_text(text + "\n", encoding="utf-8")
