@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from worker.cgroup import cpu_limit, memory_limit, out_of_memory_kills
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 GIB = 1 << 30
 
