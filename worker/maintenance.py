@@ -1,0 +1,93 @@
+"""Keeping order: lost jobs, expired jobs, garbage and orphans in the storage.
+
+Every worker runs this beside its work, and the API should too; doing it twice at once is harmless.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import TYPE_CHECKING
+
+import structlog
+from redis.exceptions import RedisError
+
+from worker.records import PREFIX
+from worker.storage import StorageError
+
+if TYPE_CHECKING:
+    from worker.queue import JobQueue
+
+ORPHAN_LOOK_SECONDS = 3600.0
+
+_OBJECT = re.compile(r"(?P<kind>uploads|results)/(?P<job>[^/]+)/(?:(?P<attempt>\d+)/)?")
+
+log = structlog.get_logger(__name__)
+
+
+class Maintenance:
+    """One keeper of order.
+
+    Parameters
+    ----------
+    queue : JobQueue
+    """
+
+    def __init__(self, queue: JobQueue) -> None:
+        self.queue = queue
+
+    def run_once(self) -> None:
+        """Do all that is due; failures of Redis or of the storage are left for the next time."""
+        for part in (self.queue.recover, self.expire, self.collect_garbage, self.collect_orphans):
+            try:
+                part()
+            except (RedisError, StorageError) as error:
+                log.warning("maintenance is put off", part=part.__name__, reason=str(error))
+
+    def expire(self) -> None:
+        """Delete the jobs whose time to live has passed."""
+        for job_id in self.queue.records.expired():
+            if self.queue.delete(job_id, only_expired=True):
+                log.info("job expired", job=job_id)
+
+    def collect_garbage(self) -> None:
+        """Remove the objects of deleted jobs and of attempts that came to nothing."""
+        for prefix in self.queue.records.garbage():
+            self.queue.storage.delete_prefix(prefix)
+            self.queue.records.forget_garbage(prefix)
+
+    def collect_orphans(self) -> None:
+        """Once an hour, remove old objects that no record knows.
+
+        Such are uploads whose client went away before there was a job, and results of an attempt
+        that wrote on after it had been given up.
+        """
+        settings = self.queue.settings
+        period = min(ORPHAN_LOOK_SECONDS, settings.orphan_grace_seconds)
+        if self.queue.redis.set(f"{PREFIX}:orphans", 1, nx=True, px=int(period * 1000)):
+            for prefix in self._orphans(time.time() - settings.orphan_grace_seconds):
+                log.info("objects of no job removed", prefix=prefix)
+                self.queue.storage.delete_prefix(prefix)
+
+    def _orphans(self, before: float) -> list[str]:
+        """Return prefixes without a record, none of whose objects changed after a time."""
+        latest: dict[tuple[str, str, str | None], float] = {}
+        for kind in ("uploads/", "results/"):
+            for item in self.queue.storage.list_prefix(kind):
+                if found := _OBJECT.match(item.key):
+                    place = (found["kind"], found["job"], found["attempt"])
+                    latest[place] = max(latest.get(place, 0.0), item.modified)
+        orphans = []
+        for (kind, job_id, attempt), modified in latest.items():
+            if modified >= before:
+                continue
+            prefix = f"{kind}/{job_id}/" + (f"{attempt}/" if attempt else "")
+            record = self.queue.records.get(job_id)
+            needed = record is not None and (
+                kind == "uploads"
+                or prefix == record.result_prefix
+                or (record.status == "running" and attempt == str(record.attempt))
+            )
+            if not needed:
+                orphans.append(prefix)
+        return orphans

@@ -1,0 +1,247 @@
+"""The queue: submit, cancel, delete and retry jobs, and repair what crashes leave behind.
+
+The record of a job (`worker.records`) is the truth; an RQ job is only a ticket that leads some
+worker to it. A ticket may be lost or come twice without harm: `JobQueue.recover` gives a new one to
+a queued record that has none, and a second ticket finds that its job is taken.
+"""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import structlog
+from rq import Queue
+from rq.exceptions import NoSuchJobError
+from rq.job import Job
+from rq.serializers import JSONSerializer
+
+from worker.connections import connect
+from worker.problems import WorkerLost, problem_document
+from worker.records import (
+    PREFIX,
+    JobActive,
+    JobRecord,
+    RecordStore,
+    results_prefix,
+    upload_prefix,
+)
+from worker.storage import ObjectStorage, StorageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from redis import Redis
+
+    from worker.settings import Settings
+
+TASK = "worker.task.run"
+"""Name of the function that RQ runs; its only argument is the job id."""
+
+TICKET_TTL = 60
+"""Seconds for which RQ remembers a ticket whose work-horse died."""
+
+_LATE_WRITER_SECONDS = 15.0
+"""After a deletion a worker that has not noticed may write for a while; look again after that."""
+
+log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What a look for lost jobs found, as ids.
+
+    Attributes
+    ----------
+    requeued : tuple of str
+        Given to the queue again: their worker fell silent, or their ticket was lost.
+    failed : tuple of str
+        Lost too often.
+    cancelled : tuple of str
+        Their worker fell silent after they were asked to stop.
+    """
+
+    requeued: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
+    cancelled: tuple[str, ...] = ()
+
+
+class JobQueue:
+    """The way in for the service, and the keeper of order for the workers.
+
+    Parameters
+    ----------
+    settings : Settings
+    redis : Redis, optional
+        Client that does not decode answers; by default one to ``settings.redis_url``.
+    storage : ObjectStorage, optional
+        By default that of ``settings.objects_url``, opened when it is first needed.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        redis: Redis | None = None,
+        storage: ObjectStorage | None = None,
+    ) -> None:
+        if redis is None:
+            if settings.redis_url is None:
+                raise ValueError("the settings name no Redis server")
+            redis = connect(settings.redis_url)
+        self.settings = settings
+        self.redis = redis
+        self.records = RecordStore(redis, result_ttl=settings.result_ttl_seconds)
+        self.rq = Queue(settings.queue, connection=redis, serializer=JSONSerializer)
+        self._storage = storage
+
+    @property
+    def storage(self) -> ObjectStorage:
+        """Where inputs and results are."""
+        if self._storage is None:
+            self._storage = ObjectStorage(self.settings.objects_url)
+        return self._storage
+
+    # For the service
+
+    def submit(self, record: JobRecord) -> JobRecord:
+        """Accept a job whose inputs are stored, and return its record as it is now.
+
+        Raises
+        ------
+        JobExists
+            There is a job of this id.
+        """
+        self.records.create(record)
+        self.enqueue(record.id)
+        return self.records.get(record.id) or record
+
+    def cancel(self, job_id: str) -> JobRecord | None:
+        """Cancel a job: a queued one ends at once, a running one within a few seconds.
+
+        Returns its record (of a job that had ended, unchanged), None when there is none.
+        """
+        outcome, ticket = self.records.cancel(job_id)
+        if outcome == "cancelled":
+            self.discard_ticket(ticket)
+        return self.records.get(job_id)
+
+    def delete(self, job_id: str, *, only_expired: bool = False) -> bool:
+        """Remove a job, its inputs and its results; a running one is stopped.
+
+        Returns whether one was removed. Objects that cannot be removed now are removed by
+        `worker.maintenance` later.
+
+        Parameters
+        ----------
+        job_id : str
+        only_expired : bool
+            Keep it unless its time to live has passed.
+        """
+        outcome, ticket = self.records.delete(
+            job_id, only_expired=only_expired, again=_LATE_WRITER_SECONDS
+        )
+        if outcome != "ok":
+            return False
+        self.discard_ticket(ticket)
+        for prefix in (upload_prefix(job_id), results_prefix(job_id)):
+            try:
+                self.storage.delete_prefix(prefix)
+            except StorageError as error:
+                log.warning("objects are left for later", prefix=prefix, reason=str(error))
+        return True
+
+    def retry(self, job_id: str) -> JobRecord | None:
+        """Run a job that has ended once more; None when there is none.
+
+        Raises
+        ------
+        JobActive
+            It has not ended.
+        """
+        outcome = self.records.retry(job_id)
+        if outcome == "active":
+            raise JobActive(job_id)
+        if outcome == "ok":
+            self.enqueue(job_id)
+        return self.records.get(job_id)
+
+    def position(self, job_id: str) -> int | None:
+        """Return how many jobs are ahead of a queued one, None when it is not queued."""
+        ticket = cast("bytes | None", self.redis.hget(f"{PREFIX}:job:{job_id}", "ticket"))
+        if ticket is None:
+            return None
+        return cast("int | None", self.redis.lpos(self.rq.key, ticket.decode()))
+
+    def length(self) -> int:
+        """Return the number of jobs that wait for a worker."""
+        return self.records.count()["queued"]
+
+    def workers(self) -> int:
+        """Return the number of workers that gave a sign of life within the last seconds."""
+        return self.records.workers_since(2 * self.settings.lease_seconds)
+
+    # Tickets
+
+    def enqueue(self, job_id: str, *, first: bool = False) -> None:
+        """Give a queued job a ticket; nothing happens when it is not queued."""
+        ticket = f"{job_id}-{uuid.uuid4().hex[:12]}"
+        former = self.records.assign_ticket(job_id, ticket)
+        if former is None:
+            return
+        self.rq.enqueue_call(
+            TASK,
+            args=(job_id,),
+            timeout=-1,  # the worker enforces the job's own limit
+            result_ttl=0,
+            failure_ttl=TICKET_TTL,
+            description=job_id,
+            job_id=ticket,
+            at_front=first,
+        )
+        if former:
+            self.discard_ticket(former)
+
+    def discard_ticket(self, ticket: str) -> None:
+        """Remove all that RQ knows of a ticket."""
+        if not ticket:
+            return
+        self.redis.lrem(self.rq.key, 0, ticket)
+        self.redis.lrem(self.rq.intermediate_queue_key, 0, ticket)
+        try:
+            Job.fetch(ticket, connection=self.redis, serializer=JSONSerializer).delete()
+        except (NoSuchJobError, ValueError):
+            # ValueError: the execution's own hash has expired before its entry in the registry.
+            self.redis.delete(Job.key_for(ticket))
+
+    # Keeping order
+
+    def recover(self) -> Recovered:
+        """Queue again what was accepted but lost; safe at any time and from any process.
+
+        Jobs whose worker fell silent become queued again (or end, when they were asked to stop or
+        were lost too often), and queued jobs without a place in RQ get one.
+        """
+        settings = self.settings
+        outcomes = self.records.expire_leases(
+            grace=2 * settings.heartbeat_seconds,
+            max_attempts=settings.max_attempts,
+            problem=problem_document(WorkerLost(settings.max_attempts)),
+        )
+        silent = [job_id for job_id, outcome in outcomes.items() if outcome == "queued"]
+        for job_id in silent:
+            log.warning("worker lost, job queued again", job=job_id)
+            self.enqueue(job_id, first=True)
+        unticketed: Sequence[str] = ()
+        if self.redis.set(
+            f"{PREFIX}:looking", 1, nx=True, px=int(settings.lost_ticket_seconds * 500)
+        ):
+            unticketed = self.records.without_ticket(settings.lost_ticket_seconds, [self.rq.key])
+            for job_id in unticketed:
+                log.warning("ticket lost, job queued again", job=job_id)
+                self.enqueue(job_id, first=True)
+        return Recovered(
+            requeued=(*silent, *unticketed),
+            failed=tuple(j for j, outcome in outcomes.items() if outcome == "failed"),
+            cancelled=tuple(j for j, outcome in outcomes.items() if outcome == "cancelled"),
+        )

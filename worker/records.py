@@ -1,0 +1,586 @@
+"""Job records: what is known of a job, and the atomic steps that change it.
+
+A record is a hash in Redis; `transitions.lua` documents all keys and is the only code that writes
+them. The record is the truth about a job: RQ merely carries its id to some worker.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import time
+import uuid
+from dataclasses import dataclass, field
+from enum import StrEnum
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast, get_args
+
+from smsr.progress import Progress
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from redis import Redis
+
+PREFIX = "smsr"
+"""First part of every key."""
+
+Status: TypeAlias = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+STATUSES: tuple[Status, ...] = get_args(Status)
+FINAL: tuple[Status, ...] = ("succeeded", "failed", "cancelled")
+
+_DOCUMENTS = ("options", "inputs", "progress", "metrics", "timings", "problem")
+_PAGE_LIMIT = 1000
+_WORKERS = f"{PREFIX}:workers"
+"""Sorted set of the names of worker processes by their last sign of life."""
+
+
+class JobExists(Exception):
+    """There is a job of this id already."""
+
+
+class JobActive(Exception):
+    """The job is queued or running, and the step needs one that has ended."""
+
+
+class Verdict(StrEnum):
+    """Whether an attempt may go on.
+
+    CANCELLED: it was asked to stop. LOST: the job was given to another attempt or has ended.
+    GONE: the job was deleted.
+    """
+
+    OK = "ok"
+    CANCELLED = "cancelled"
+    LOST = "lost"
+    GONE = "gone"
+
+
+@dataclass(frozen=True, slots=True)
+class InputFile:
+    """An uploaded file: its object, what the client called it, and what was counted."""
+
+    key: str
+    name: str
+    bytes: int
+    sha256: str
+    content_type: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobRecord:
+    """All that is known of a job; times are Unix seconds.
+
+    Attributes
+    ----------
+    id : str
+        32 hexadecimal digits.
+    status : {'queued', 'running', 'succeeded', 'failed', 'cancelled'}
+    created_at, started_at, finished_at, expires_at : float or None
+        `started_at` is that of the current attempt.
+    options : dict
+        Fields of `worker.options.JobOptions`.
+    inputs : dict of str to InputFile
+        By role: 'measurements', 'ground_truth', 'faces'.
+    name, owner : str or None
+        A name for people; whose job it is (listings can be restricted to an owner).
+    frames, points : int or None
+        T and N, as soon as they are known.
+    attempt : int
+        Number of starts, and the fencing token of the current one.
+    lost_attempts : int
+        How many of them ended with their worker.
+    progress : Progress or None
+    result_prefix : str or None
+        Where the objects of the result lie; only ever set together with 'succeeded'.
+    metrics : dict or None
+        Error against the ground truth, when one was given.
+    timings : dict of str to float
+        Seconds: queued, each stage, total.
+    problem : dict or None
+        RFC 9457 problem document (without instance) of a failed job.
+    cancel_requested : bool
+    worker : str or None
+        Name of the worker that runs it.
+    version : int
+        Grows with every visible change.
+    """
+
+    id: str
+    status: Status
+    created_at: float
+    options: Mapping[str, Any]
+    inputs: Mapping[str, InputFile]
+    name: str | None = None
+    owner: str | None = None
+    frames: int | None = None
+    points: int | None = None
+    attempt: int = 0
+    lost_attempts: int = 0
+    started_at: float | None = None
+    finished_at: float | None = None
+    expires_at: float | None = None
+    progress: Progress | None = None
+    result_prefix: str | None = None
+    metrics: Mapping[str, Any] | None = None
+    timings: Mapping[str, float] = field(default_factory=dict)
+    problem: Mapping[str, Any] | None = None
+    cancel_requested: bool = False
+    worker: str | None = None
+    version: int = 0
+
+    @classmethod
+    def new(
+        cls,
+        job_id: str | None = None,
+        *,
+        options: Mapping[str, Any],
+        inputs: Mapping[str, InputFile],
+        name: str | None = None,
+        owner: str | None = None,
+        frames: int | None = None,
+        points: int | None = None,
+    ) -> JobRecord:
+        """Return the record of a job to submit; Redis stamps its time of creation."""
+        return cls(
+            id=job_id or new_job_id(),
+            status="queued",
+            created_at=time.time(),
+            options=options,
+            inputs=inputs,
+            name=name,
+            owner=owner,
+            frames=frames,
+            points=points,
+        )
+
+    @property
+    def final(self) -> bool:
+        """Whether the job has ended."""
+        return self.status in FINAL
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A part of a listing, and where the next part begins."""
+
+    records: tuple[JobRecord, ...]
+    next_cursor: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """What a worker learns when it renews its lease on a job.
+
+    Attributes
+    ----------
+    state : {'held', 'queued', 'lost', 'gone'}
+        'held' by this worker; still or again 'queued'; 'lost' to another worker or ended; deleted.
+    attempt : int
+    running_seconds : float
+        Since the attempt began.
+    cancel_seconds : float or None
+        Since the job was asked to stop, None when it was not.
+    stage : str
+        Last reported stage, empty before the first report.
+    """
+
+    state: Literal["held", "queued", "lost", "gone"]
+    attempt: int = 0
+    running_seconds: float = 0.0
+    cancel_seconds: float | None = None
+    stage: str = ""
+
+
+def new_job_id() -> str:
+    """Return an id that nobody can guess."""
+    return uuid.uuid4().hex
+
+
+def upload_prefix(job_id: str) -> str:
+    """Return the prefix of a job's inputs."""
+    return f"uploads/{job_id}/"
+
+
+def upload_key(job_id: str, role: str) -> str:
+    """Return the object key of one input."""
+    return upload_prefix(job_id) + role
+
+
+def results_prefix(job_id: str) -> str:
+    """Return the prefix of the results of all attempts of a job."""
+    return f"results/{job_id}/"
+
+
+def result_prefix(job_id: str, attempt: int) -> str:
+    """Return the prefix of the results of one attempt."""
+    return f"{results_prefix(job_id)}{attempt}/"
+
+
+def record_key(job_id: str) -> str:
+    """Return the key of a record."""
+    return f"{PREFIX}:job:{job_id}"
+
+
+def changed_channel(job_id: str) -> str:
+    """Return the channel on which a job's changes are announced."""
+    return f"{PREFIX}:changed:{job_id}"
+
+
+class RecordStore:
+    """Records in Redis.
+
+    Parameters
+    ----------
+    redis : Redis
+        A client that does not decode answers.
+    result_ttl : float
+        Seconds a finished job is kept; 0 keeps it for ever.
+    """
+
+    def __init__(self, redis: Redis, *, result_ttl: float = 0) -> None:
+        self.redis = redis
+        self.result_ttl = result_ttl
+        source = resources.files("worker").joinpath("transitions.lua").read_text(encoding="utf-8")
+        self._script = redis.register_script(source)
+
+    def _step(self, step: str, job_id: str, *arguments: str | float) -> Any:
+        return self._script(keys=[PREFIX], args=[step, job_id, *arguments])
+
+    # Reading
+
+    def get(self, job_id: str) -> JobRecord | None:
+        """Return a record, or None when there is no such job."""
+        return decode(job_id, cast("dict[bytes, bytes]", self.redis.hgetall(record_key(job_id))))
+
+    def list(
+        self,
+        status: Status | None = None,
+        cursor: str | None = None,
+        limit: int = 50,
+        *,
+        owner: str | None = None,
+    ) -> Page:
+        """Return records, newest first.
+
+        Pages are stable: a job appears on the page that its time of creation says, whatever was
+        submitted or deleted in between.
+
+        Raises
+        ------
+        ValueError
+            The cursor is none that a page gave, or the status does not exist.
+        """
+        if status is not None and status not in STATUSES:
+            raise ValueError(f"there is no status {status!r}; there are {', '.join(STATUSES)}")
+        index = _index(status, owner)
+        limit = max(1, min(limit, _PAGE_LIMIT))
+        ids, more = self._ids_after(index, _parse_cursor(cursor), limit)
+        with self.redis.pipeline(transaction=False) as pipe:
+            for job_id, _ in ids:
+                pipe.hgetall(record_key(job_id))
+            hashes = pipe.execute()
+        records = [decode(job_id, found) for (job_id, _), found in zip(ids, hashes, strict=True)]
+        last = f"{ids[-1][1]:.6f}:{ids[-1][0]}" if more and ids else None
+        return Page(tuple(r for r in records if r is not None), last)
+
+    def _ids_after(
+        self, index: str, after: tuple[float, str] | None, limit: int
+    ) -> tuple[Sequence[tuple[str, float]], bool]:
+        """Return up to `limit` (id, time) pairs, newest first, and whether there are more."""
+        start = "+inf" if after is None else f"{after[0]:.6f}"
+        found: Sequence[tuple[str, float]] = ()
+        offset = 0
+        while len(found) <= limit:
+            # Redis has ids of one time in reverse order, so those up to the cursor's are skipped.
+            chunk = cast(
+                "list[tuple[bytes, float]]",
+                self.redis.zrevrangebyscore(
+                    index, start, "-inf", start=offset, num=limit + 1, withscores=True
+                ),
+            )
+            pairs = [(member.decode(), score) for member, score in chunk]
+            found = (*found, *(p for p in pairs if after is None or (p[1], p[0]) < after))
+            offset += len(pairs)
+            if len(pairs) <= limit:
+                break
+        return found[:limit], len(found) > limit
+
+    def count(self, owner: str | None = None) -> dict[Status, int]:
+        """Return the number of jobs of each status."""
+        with self.redis.pipeline() as pipe:
+            for status in STATUSES:
+                pipe.zcard(_index(status, owner))
+            return dict(zip(STATUSES, pipe.execute(), strict=True))
+
+    def expired(self, limit: int = 100) -> Sequence[str]:
+        """Return ids of jobs whose time to live has passed."""
+        due = self.redis.zrangebyscore(f"{PREFIX}:expiry", "-inf", self._now(), start=0, num=limit)
+        return [job_id.decode() for job_id in cast("list[bytes]", due)]
+
+    def garbage(self, limit: int = 100) -> Sequence[str]:
+        """Return storage prefixes that are to be removed now."""
+        due = self.redis.zrangebyscore(f"{PREFIX}:garbage", "-inf", self._now(), start=0, num=limit)
+        return [prefix.decode() for prefix in cast("list[bytes]", due)]
+
+    def forget_garbage(self, prefix: str) -> None:
+        """Note that nothing is left under a storage prefix."""
+        self.redis.zrem(f"{PREFIX}:garbage", prefix)
+
+    def sign_of_life(self, worker: str, forget_seconds: float = 3600) -> None:
+        """Note that a worker process lives."""
+        now = self._now()
+        with self.redis.pipeline() as pipe:
+            pipe.zadd(_WORKERS, {worker: now})
+            pipe.zremrangebyscore(_WORKERS, "-inf", now - forget_seconds)
+            pipe.execute()
+
+    def sign_off(self, worker: str) -> None:
+        """Note that a worker process ends."""
+        self.redis.zrem(_WORKERS, worker)
+
+    def workers_since(self, seconds: float) -> int:
+        """Return the number of worker processes that gave a sign of life since then."""
+        return self.redis.zcount(_WORKERS, self._now() - seconds, "+inf")
+
+    def _now(self) -> float:
+        seconds, microseconds = self.redis.time()
+        return seconds + microseconds / 1e6
+
+    # The client's steps
+
+    def create(self, record: JobRecord) -> None:
+        """Store a new record as queued.
+
+        Raises
+        ------
+        JobExists
+            There is a record of this id.
+        """
+        fields: dict[str, str | int] = {
+            "options": _encode(record.options),
+            "inputs": _encode({r: dataclasses.asdict(f) for r, f in record.inputs.items()}),
+        }
+        for name in ("name", "frames", "points"):
+            value = getattr(record, name)
+            if value is not None:
+                fields[name] = value
+        flat = [part for item in fields.items() for part in item]
+        owner = record.owner or ""
+        if self._step("create", record.id, owner, uuid.uuid4().hex, *flat) != b"ok":
+            raise JobExists(record.id)
+
+    def assign_ticket(self, job_id: str, ticket: str) -> str | None:
+        """Note the RQ job that carries this job; return the one it replaces, '' for none.
+
+        None when the job is not queued (any more).
+        """
+        former = self._step("ticket", job_id, ticket)
+        return None if former is None else cast("bytes", former).decode()
+
+    def cancel(
+        self, job_id: str
+    ) -> tuple[Literal["cancelled", "requested", "finished", "gone"], str]:
+        """Cancel a queued job at once (and return its ticket) or ask a running one to stop."""
+        outcome, *ticket = self._step("cancel", job_id, self.result_ttl)
+        return outcome.decode(), ticket[0].decode() if ticket else ""
+
+    def retry(self, job_id: str) -> Literal["ok", "active", "gone"]:
+        """Make a finished job queued again."""
+        return cast("Literal['ok', 'active', 'gone']", self._step("retry", job_id).decode())
+
+    def delete(
+        self, job_id: str, *, only_expired: bool = False, again: float = 0
+    ) -> tuple[Literal["ok", "gone", "kept"], str]:
+        """Remove a record and put its objects on the list of garbage.
+
+        Parameters
+        ----------
+        job_id : str
+        only_expired : bool
+            Keep it unless its time to live has passed.
+        again : float
+            Seconds until its objects are removed by maintenance: the caller removes them at once,
+            and a worker that did not notice yet may write some more.
+        """
+        outcome, *ticket = self._step("delete", job_id, str(int(only_expired)), again)
+        return outcome.decode(), ticket[0].decode() if ticket else ""
+
+    # The worker's steps
+
+    def begin_attempt(self, job_id: str, *, worker: str, ticket: str, lease: float) -> int | None:
+        """Start a queued job; return its attempt, or None when there is nothing to do.
+
+        Parameters
+        ----------
+        job_id : str
+        worker : str
+            Name of the worker process, which will renew the lease.
+        ticket : str
+            RQ job that led here; beginning again with the same ticket is the same attempt.
+        lease : float
+            Seconds for which the job is held.
+        """
+        outcome, *attempt = self._step("begin", job_id, worker, ticket, lease)
+        return int(attempt[0]) if outcome == b"ok" else None
+
+    def renew(self, job_id: str, *, worker: str, lease: float) -> Hold:
+        """Hold a job for another while and learn how it stands."""
+        state, *rest = self._step("renew", job_id, worker, lease)
+        if not rest:
+            return Hold(state.decode())
+        attempt, running, cancel, progress = rest
+        return Hold(
+            state=state.decode(),
+            attempt=int(attempt),
+            running_seconds=float(running),
+            cancel_seconds=float(cancel) if float(cancel) >= 0 else None,
+            stage=json.loads(progress)["stage"] if progress else "",
+        )
+
+    def report_progress(
+        self,
+        job_id: str,
+        attempt: int,
+        progress: Progress,
+        *,
+        lease: float,
+        frames: int | None = None,
+        points: int | None = None,
+    ) -> Verdict:
+        """Show how far an attempt is; this renews its lease too."""
+        size = ("", "") if frames is None or points is None else (frames, points)
+        document = _encode(dataclasses.asdict(progress))
+        return self._verdict("progress", job_id, attempt, document, lease, *size)
+
+    def publish(
+        self,
+        job_id: str,
+        attempt: int,
+        *,
+        frames: int,
+        points: int,
+        timings: Mapping[str, float],
+        metrics: Mapping[str, Any] | None = None,
+    ) -> Verdict:
+        """Make the results of an attempt those of the job, in one step."""
+        fields: list[str | int] = ["frames", frames, "points", points, "timings", _encode(timings)]
+        fields += ["progress", _encode(dataclasses.asdict(Progress("done", 1.0)))]
+        if metrics is not None:
+            fields += ["metrics", _encode(metrics)]
+        prefix = result_prefix(job_id, attempt)
+        return self._verdict("publish", job_id, attempt, prefix, self.result_ttl, *fields)
+
+    def fail(self, job_id: str, attempt: int, problem: Mapping[str, Any]) -> Verdict:
+        """End a job with a problem document."""
+        return self._verdict("fail", job_id, attempt, _encode(problem), self.result_ttl)
+
+    def stop(self, job_id: str, attempt: int) -> Verdict:
+        """End a job that was asked to stop; CANCELLED when it has ended so."""
+        return self._verdict("stop", job_id, attempt, self.result_ttl)
+
+    def _verdict(self, step: str, job_id: str, attempt: int, *arguments: str | float) -> Verdict:
+        return Verdict(self._step(step, job_id, attempt, *arguments).decode())
+
+    def release(
+        self,
+        job_id: str,
+        holder: str | int,
+        *,
+        lost: bool,
+        max_attempts: int,
+        problem: Mapping[str, Any],
+    ) -> Literal["queued", "failed", "cancelled", "lost", "gone"]:
+        """Take a running job from its worker.
+
+        Parameters
+        ----------
+        job_id : str
+        holder : str or int
+            Name of the worker, or the attempt: nothing happens when it does not hold the job.
+        lost : bool
+            Whether this counts as a lost attempt (a stopping worker's does not).
+        max_attempts : int
+            Losses after which the job fails with `problem`.
+        problem : mapping
+        """
+        outcome = self._step(
+            "release", job_id, holder, int(lost), max_attempts, _encode(problem), self.result_ttl
+        )
+        return cast("Literal['queued']", outcome.decode())
+
+    # Recovery
+
+    def expire_leases(
+        self, *, grace: float, max_attempts: int, problem: Mapping[str, Any]
+    ) -> dict[str, str]:
+        """Take jobs from workers that fell silent; return what became of each.
+
+        A job is taken at the second look, `grace` seconds or more after the first one that found
+        its lease to have run out.
+        """
+        flat = self._step("expire", "*", grace, max_attempts, _encode(problem), self.result_ttl)
+        texts = [part.decode() for part in flat]
+        return dict(zip(texts[::2], texts[1::2], strict=True))
+
+    def without_ticket(self, age: float, lists: Sequence[str]) -> Sequence[str]:
+        """Return queued jobs, older than `age` seconds, whose ticket is in none of the RQ lists."""
+        return [job_id.decode() for job_id in self._step("unticketed", "*", age, *lists)]
+
+
+def decode(job_id: str, found: Mapping[bytes, bytes]) -> JobRecord | None:
+    """Build a record from its hash; None from an empty one."""
+    if not found:
+        return None
+    texts = {key.decode(): value.decode() for key, value in found.items()}
+    documents = {name: json.loads(texts[name]) for name in _DOCUMENTS if name in texts}
+
+    def number(name: str) -> float | None:
+        return float(texts[name]) if name in texts else None
+
+    def integer(name: str) -> int | None:
+        return int(texts[name]) if name in texts else None
+
+    progress = documents.get("progress")
+    return JobRecord(
+        id=job_id,
+        status=cast("Status", texts["status"]),
+        created_at=float(texts["created_at"]),
+        options=documents["options"],
+        inputs={role: InputFile(**file) for role, file in documents["inputs"].items()},
+        name=texts.get("name"),
+        owner=texts.get("owner") or None,
+        frames=integer("frames"),
+        points=integer("points"),
+        attempt=int(texts["attempt"]),
+        lost_attempts=int(texts["lost_attempts"]),
+        started_at=number("started_at"),
+        finished_at=number("finished_at"),
+        expires_at=number("expires_at"),
+        progress=Progress(**progress) if progress else None,
+        result_prefix=texts.get("result_prefix"),
+        metrics=documents.get("metrics"),
+        timings=documents.get("timings", {}),
+        problem=documents.get("problem"),
+        cancel_requested="cancel_requested_at" in texts or texts["status"] == "cancelled",
+        worker=texts.get("worker"),
+        version=int(texts["version"]),
+    )
+
+
+def _encode(document: object) -> str:
+    return json.dumps(document, allow_nan=False, separators=(",", ":"))
+
+
+def _index(status: Status | None, owner: str | None) -> str:
+    return f"{PREFIX}:jobs" + (f"@{owner}" if owner else "") + (f":{status}" if status else "")
+
+
+def _parse_cursor(cursor: str | None) -> tuple[float, str] | None:
+    if cursor is None:
+        return None
+    created, _, job_id = cursor.partition(":")
+    if not re.fullmatch(r"\d+\.\d{6}:.+", cursor):
+        raise ValueError(f"{cursor!r} is no cursor of a listing")
+    return float(created), job_id

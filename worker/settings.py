@@ -1,0 +1,130 @@
+"""Everything that an operator may set, read from the environment (prefix ``SMSR_``)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AliasChoices, Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+GIBIBYTE = 1 << 30
+DAY = 86400
+
+
+class Settings(BaseSettings):
+    """Settings of the queue and its workers.
+
+    Each field can be given as an environment variable ``SMSR_<FIELD>``; the Redis address also as
+    the customary ``REDIS_URL``. Without one an embedded server is meant (`worker.redis_server`).
+    """
+
+    model_config = SettingsConfigDict(
+        env_prefix="SMSR_", frozen=True, extra="ignore", populate_by_name=True
+    )
+
+    data_dir: Path = Field(
+        default=Path("smsr-data"),
+        description="Folder of the embedded Redis server, of the objects and of scratch files.",
+    )
+    redis_url: Annotated[
+        str | None,
+        Field(
+            default=None,
+            validation_alias=AliasChoices("SMSR_REDIS_URL", "REDIS_URL"),
+            description="redis://, rediss:// or unix:// address of Redis 6.2 or later.",
+        ),
+    ]
+    storage_url: str | None = Field(
+        default=None,
+        description="Where inputs and results are kept: file:///folder or s3://bucket/prefix. "
+        "Without it a folder in the data folder.",
+    )
+    scratch_dir: Path | None = Field(
+        default=None,
+        description="Folder for the files of a running job; without it a folder in the data folder."
+        " Results move into file:// storage without a copy where both share a file system.",
+    )
+
+    max_upload_bytes: int = Field(default=4 * GIBIBYTE, gt=0, description="Largest upload.")
+    max_array_bytes: int = Field(
+        default=16 * GIBIBYTE, gt=0, description="Largest array, decompressed."
+    )
+    job_timeout_seconds: float = Field(
+        default=3600, gt=0, description="Longest run of one job; a job may ask for less."
+    )
+    result_ttl_seconds: float = Field(
+        default=7 * DAY, ge=0, description="How long a finished job is kept; 0 keeps it for ever."
+    )
+    orphan_grace_seconds: float = Field(
+        default=DAY,
+        gt=0,
+        description="Age after which stored objects that belong to no job are removed.",
+    )
+
+    queue: str = Field(default="smsr", pattern=r"^[A-Za-z0-9_-]+$", description="Name in RQ.")
+    workers: int = Field(default=1, ge=1, description="Worker processes on this machine.")
+    threads: int | None = Field(
+        default=None, ge=1, description="BLAS threads of a worker; without it cores / workers."
+    )
+
+    max_attempts: int = Field(
+        default=12, ge=1, description="Starts of a job whose workers keep dying before it fails."
+    )
+    lease_seconds: float = Field(
+        default=6, gt=0, description="Silence after which a worker is taken for dead."
+    )
+    heartbeat_seconds: float = Field(
+        default=1, gt=0, description="How often a worker renews its lease and looks after its job."
+    )
+    cancel_grace_seconds: float = Field(
+        default=3, ge=0, description="Time a cancelled job has to stop by itself before a SIGKILL."
+    )
+    shutdown_grace_seconds: float = Field(
+        default=5, ge=0, description="Time a stopping worker leaves its job before handing it back."
+    )
+    progress_interval_seconds: float = Field(
+        default=0.25, ge=0, description="Shortest time between two progress reports."
+    )
+    storage_retry_seconds: float = Field(
+        default=60, ge=0, description="How long a failing storage is tried before a job is re-run."
+    )
+    maintenance_interval_seconds: float = Field(
+        default=1, gt=0, description="Time between two looks for lost and expired jobs."
+    )
+    lost_ticket_seconds: float = Field(
+        default=5, gt=0, description="Age of a queued job without a place in RQ to be queued again."
+    )
+
+    log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR|CRITICAL)$")
+
+    @property
+    def objects_url(self) -> str:
+        """Address of the object storage that is in force."""
+        return self.storage_url or (self.data_dir / "objects").resolve().as_uri()
+
+    @property
+    def scratch(self) -> Path:
+        """Scratch folder that is in force."""
+        return (self.scratch_dir or self.data_dir / "scratch").resolve()
+
+    @property
+    def threads_per_worker(self) -> int:
+        """Number of BLAS threads of one worker."""
+        return self.threads or max(1, available_cores() // self.workers)
+
+    def to_environ(self) -> dict[str, str]:
+        """Return environment variables that give a subprocess the same settings."""
+        return {
+            f"SMSR_{name.upper()}": str(value)
+            for name, value in self.model_dump(mode="json").items()
+            if value is not None
+        }
+
+
+def available_cores() -> int:
+    """Return the number of cores this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

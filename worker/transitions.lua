@@ -1,0 +1,374 @@
+-- The life of a job: every change of its record is one atomic step here.
+--
+-- KEYS[1]  prefix of all keys ("smsr")
+-- ARGV[1]  name of the step, ARGV[2] job id, then the step's own arguments
+--
+-- Keys, all under the prefix:
+--   job:{id}                     hash: the record (documents inside it are JSON text)
+--   jobs, jobs:{status}          sorted sets of ids by time of creation
+--   jobs@{owner}[:{status}]      the same for the jobs of one owner
+--   leases                       sorted set of running ids by the end of their lease
+--   expiry                       sorted set of finished ids by the end of their time to live
+--   garbage                      sorted set of storage prefixes by the time they are to be removed
+--   changed:{id}                 channel: the record's version at every visible change
+--
+-- `attempt` is a fencing token: it grows with every start of the job, and only the holder of the
+-- current one, while the job is running, may report, publish or fail. Every step may be sent twice
+-- (a client repeats it when the connection broke before the answer came) with the effect of once.
+
+redis.replicate_commands() -- Redis 6 needs it to write after TIME; later ones do it anyway
+
+local prefix, step, id = KEYS[1] .. ':', ARGV[1], ARGV[2]
+local record = prefix .. 'job:' .. id
+local leases, expiry, garbage = prefix .. 'leases', prefix .. 'expiry', prefix .. 'garbage'
+
+local time = redis.call('TIME')
+local now = tonumber(time[1]) + tonumber(time[2]) / 1e6
+
+local function stamp(seconds)
+  return string.format('%.6f', seconds)
+end
+
+local function read(key, field)
+  return redis.call('HGET', key, field) or nil
+end
+
+local function changed(job)
+  local version = redis.call('HINCRBY', prefix .. 'job:' .. job, 'version', 1)
+  redis.call('PUBLISH', prefix .. 'changed:' .. job, version)
+end
+
+local function indices(owner, status)
+  local names = { prefix .. 'jobs' .. status }
+  if owner and owner ~= '' then
+    names[2] = prefix .. 'jobs@' .. owner .. status
+  end
+  return names
+end
+
+local function set_status(job, to)
+  local key = prefix .. 'job:' .. job
+  local owner, from, created = read(key, 'owner'), read(key, 'status'), read(key, 'created_at')
+  for _, index in ipairs(indices(owner, ':' .. from)) do
+    redis.call('ZREM', index, job)
+  end
+  for _, index in ipairs(indices(owner, ':' .. to)) do
+    redis.call('ZADD', index, created, job)
+  end
+  redis.call('HSET', key, 'status', to)
+end
+
+local function discard_results(job, first, last)
+  for attempt = first, last do
+    redis.call('ZADD', garbage, stamp(now), 'results/' .. job .. '/' .. attempt .. '/')
+  end
+end
+
+-- Ends a job; a time to live of 0 keeps it for ever.
+local function finish(job, status, ttl)
+  local key = prefix .. 'job:' .. job
+  redis.call('ZREM', leases, job)
+  redis.call('HDEL', key, 'worker', 'suspected_at', 'cancel_requested_at')
+  redis.call('HSET', key, 'finished_at', stamp(now))
+  if tonumber(ttl) > 0 then
+    redis.call('HSET', key, 'expires_at', stamp(now + ttl))
+    redis.call('ZADD', expiry, stamp(now + ttl), job)
+  end
+  set_status(job, status)
+  changed(job)
+end
+
+-- Takes a running job from its worker: queued again, or ended where it was cancelled or lost too
+-- often. Returns what became of it.
+local function take_back(job, counts, max_attempts, problem, ttl)
+  local key = prefix .. 'job:' .. job
+  local attempt = tonumber(read(key, 'attempt'))
+  discard_results(job, attempt, attempt)
+  if read(key, 'cancel_requested_at') then
+    redis.call('HDEL', key, 'progress')
+    finish(job, 'cancelled', ttl)
+    return 'cancelled'
+  end
+  local lost = redis.call('HINCRBY', key, 'lost_attempts', counts)
+  if lost >= tonumber(max_attempts) then
+    redis.call('HSET', key, 'problem', problem)
+    finish(job, 'failed', ttl)
+    return 'failed'
+  end
+  redis.call('ZREM', leases, job)
+  redis.call('HDEL', key, 'worker', 'suspected_at', 'progress')
+  redis.call('HSET', key, 'enqueued_at', stamp(now))
+  set_status(job, 'queued')
+  changed(job)
+  return 'queued'
+end
+
+-- Whether an attempt may still act: 'ok', 'cancelled', 'lost' or 'gone'.
+local function verdict(attempt)
+  local status = read(record, 'status')
+  if not status then
+    return 'gone'
+  end
+  if status ~= 'running' or read(record, 'attempt') ~= attempt then
+    return 'lost'
+  end
+  if read(record, 'cancel_requested_at') then
+    return 'cancelled'
+  end
+  return 'ok'
+end
+
+local function renew(seconds)
+  redis.call('ZADD', leases, 'XX', stamp(now + seconds), id)
+  redis.call('HDEL', record, 'suspected_at')
+end
+
+local steps = {}
+
+-- owner, nonce, then field, value, ... -> 'ok' | 'exists'
+function steps.create(owner, nonce, ...)
+  local known = read(record, 'nonce')
+  if known then
+    return known == nonce and 'ok' or 'exists'
+  end
+  redis.call('HSET', record, 'status', 'queued', 'created_at', stamp(now), 'owner', owner,
+    'nonce', nonce, 'enqueued_at', stamp(now), 'attempt', 0, 'lost_attempts', 0, ...)
+  for _, status in ipairs({ '', ':queued' }) do
+    for _, index in ipairs(indices(owner, status)) do
+      redis.call('ZADD', index, stamp(now), id)
+    end
+  end
+  changed(id)
+  return 'ok'
+end
+
+-- ticket -> the ticket that it replaces ('' for none), or nil when the job is not queued
+function steps.ticket(ticket)
+  if read(record, 'status') ~= 'queued' then
+    return nil
+  end
+  local former = read(record, 'ticket') or ''
+  redis.call('HSET', record, 'ticket', ticket, 'enqueued_at', stamp(now))
+  return former == ticket and '' or former
+end
+
+-- worker, ticket, lease seconds -> {'ok', attempt} | {'busy' | 'finished' | 'gone'}
+function steps.begin(worker, ticket, lease)
+  local status = read(record, 'status')
+  if not status then
+    return { 'gone' }
+  end
+  if status == 'running' then
+    if read(record, 'worker') == worker and read(record, 'held_by') == ticket then
+      return { 'ok', tonumber(read(record, 'attempt')) }
+    end
+    return { 'busy' }
+  end
+  if status ~= 'queued' then
+    return { 'finished' }
+  end
+  local attempt = redis.call('HINCRBY', record, 'attempt', 1)
+  redis.call('HDEL', record, 'progress', 'suspected_at')
+  redis.call('HSET', record, 'worker', worker, 'held_by', ticket, 'started_at', stamp(now))
+  redis.call('ZADD', leases, stamp(now + lease), id)
+  set_status(id, 'running')
+  changed(id)
+  return { 'ok', attempt }
+end
+
+-- worker, lease seconds -> {state, attempt, seconds since start, seconds since cancel was asked
+-- for or -1, progress}; state is 'held' | 'queued' | 'lost' | 'gone'
+function steps.renew(worker, lease)
+  local status = read(record, 'status')
+  if not status then
+    return { 'gone' }
+  end
+  if status ~= 'running' or read(record, 'worker') ~= worker then
+    return { status == 'queued' and 'queued' or 'lost' }
+  end
+  renew(lease)
+  local asked = read(record, 'cancel_requested_at')
+  return { 'held', tonumber(read(record, 'attempt')), stamp(now - read(record, 'started_at')),
+    asked and stamp(now - asked) or '-1', read(record, 'progress') or '' }
+end
+
+-- attempt, progress, lease seconds, number of frames, of points ('' where unknown) -> verdict
+function steps.progress(attempt, progress, lease, frames, points)
+  local answer = verdict(attempt)
+  if answer == 'ok' or answer == 'cancelled' then
+    renew(lease)
+  end
+  if answer == 'ok' then
+    redis.call('HSET', record, 'progress', progress)
+    if frames ~= '' then
+      redis.call('HSET', record, 'frames', frames, 'points', points)
+    end
+    changed(id)
+  end
+  return answer
+end
+
+-- attempt, result prefix, ttl, then field, value, ... -> verdict
+function steps.publish(attempt, result_prefix, ttl, ...)
+  if read(record, 'status') == 'succeeded' and read(record, 'attempt') == attempt then
+    return 'ok'
+  end
+  local answer = verdict(attempt)
+  if answer == 'ok' then
+    redis.call('HSET', record, 'result_prefix', result_prefix, ...)
+    discard_results(id, 1, attempt - 1)
+    finish(id, 'succeeded', ttl)
+  end
+  return answer
+end
+
+-- attempt, problem, ttl -> verdict; a job whose cancellation was asked for ends cancelled
+function steps.fail(attempt, problem, ttl)
+  if read(record, 'status') == 'failed' and read(record, 'attempt') == attempt then
+    return 'ok'
+  end
+  local answer = verdict(attempt)
+  if answer == 'ok' then
+    redis.call('HSET', record, 'problem', problem)
+    discard_results(id, 1, attempt)
+    finish(id, 'failed', ttl)
+  end
+  return answer
+end
+
+-- attempt, ttl -> verdict; 'cancelled' when the job has ended so
+function steps.stop(attempt, ttl)
+  if read(record, 'status') == 'cancelled' then
+    return 'cancelled'
+  end
+  local answer = verdict(attempt)
+  if answer == 'cancelled' then
+    redis.call('HDEL', record, 'progress')
+    discard_results(id, 1, attempt)
+    finish(id, 'cancelled', ttl)
+  end
+  return answer
+end
+
+-- attempt or worker name, 1 if it counts as a loss, max attempts, problem when there were too many,
+-- ttl -> 'queued' | 'failed' | 'cancelled' | 'lost' | 'gone'
+function steps.release(holder, counts, max_attempts, problem, ttl)
+  local status = read(record, 'status')
+  if not status then
+    return 'gone'
+  end
+  if status ~= 'running'
+    or (read(record, 'attempt') ~= holder and read(record, 'worker') ~= holder) then
+    return 'lost'
+  end
+  return take_back(id, counts, max_attempts, problem, ttl)
+end
+
+-- id is '*'; grace seconds, max attempts, problem, ttl -> {id, outcome, ...}
+-- A lease that ran out is suspected at first and taken at a later look, so that workers that only
+-- could not reach Redis (a restart, a suspended machine) have time to come back.
+function steps.expire(grace, max_attempts, problem, ttl)
+  local outcome = {}
+  local silent = redis.call('ZRANGEBYSCORE', leases, '-inf', stamp(now), 'LIMIT', 0, 100)
+  for _, job in ipairs(silent) do
+    local key = prefix .. 'job:' .. job
+    local suspected = read(key, 'suspected_at')
+    if read(key, 'status') ~= 'running' then
+      redis.call('ZREM', leases, job)
+    elseif not suspected then
+      redis.call('HSET', key, 'suspected_at', stamp(now))
+    elseif now - suspected >= tonumber(grace) then
+      outcome[#outcome + 1] = job
+      outcome[#outcome + 1] = take_back(job, 1, max_attempts, problem, ttl)
+    end
+  end
+  return outcome
+end
+
+-- id is '*'; age in seconds, then the lists of tickets -> ids that are queued without a ticket
+function steps.unticketed(age, ...)
+  local present, missing = {}, {}
+  for _, list in ipairs({ ... }) do
+    for _, ticket in ipairs(redis.call('LRANGE', list, 0, -1)) do
+      present[ticket] = true
+    end
+  end
+  for _, job in ipairs(redis.call('ZRANGE', prefix .. 'jobs:queued', 0, -1)) do
+    local fields = redis.call('HMGET', prefix .. 'job:' .. job, 'ticket', 'enqueued_at')
+    if not (fields[1] and present[fields[1]]) and now - (fields[2] or 0) >= tonumber(age) then
+      missing[#missing + 1] = job
+    end
+  end
+  return missing
+end
+
+-- ttl -> {'cancelled' | 'requested' | 'finished' | 'gone', ticket}
+function steps.cancel(ttl)
+  local status = read(record, 'status')
+  if status == 'queued' then
+    discard_results(id, 1, tonumber(read(record, 'attempt')))
+    finish(id, 'cancelled', ttl)
+    return { 'cancelled', read(record, 'ticket') or '' }
+  end
+  if status == 'running' then
+    if redis.call('HSETNX', record, 'cancel_requested_at', stamp(now)) == 1 then
+      changed(id)
+    end
+    return { 'requested' }
+  end
+  return { status and 'finished' or 'gone' }
+end
+
+-- -> 'ok' | 'active' | 'gone'
+function steps.retry()
+  local status = read(record, 'status')
+  if not status then
+    return 'gone'
+  end
+  if status == 'queued' or status == 'running' then
+    return 'active'
+  end
+  discard_results(id, 1, tonumber(read(record, 'attempt')))
+  redis.call('HDEL', record, 'problem', 'metrics', 'timings', 'result_prefix', 'progress',
+    'started_at', 'finished_at', 'expires_at')
+  redis.call('HSET', record, 'lost_attempts', 0, 'enqueued_at', stamp(now))
+  redis.call('ZREM', expiry, id)
+  set_status(id, 'queued')
+  changed(id)
+  return 'ok'
+end
+
+-- '1' to delete only what has outlived its time, seconds until the objects are looked for again
+-- -> {'ok' | 'gone' | 'kept', ticket}
+function steps.delete(only_expired, again)
+  local status = read(record, 'status')
+  if not status then
+    redis.call('ZREM', expiry, id)
+    return { 'gone' }
+  end
+  if only_expired == '1' then
+    local due = redis.call('ZSCORE', expiry, id)
+    if not due or tonumber(due) > now then
+      return { 'kept' }
+    end
+  end
+  local owner, ticket = read(record, 'owner'), read(record, 'ticket') or ''
+  for _, part in ipairs({ '', ':' .. status }) do
+    for _, index in ipairs(indices(owner, part)) do
+      redis.call('ZREM', index, id)
+    end
+  end
+  for attempt = 1, tonumber(read(record, 'attempt')) do
+    redis.call('ZREM', garbage, 'results/' .. id .. '/' .. attempt .. '/')
+  end
+  redis.call('ZREM', leases, id)
+  redis.call('ZREM', expiry, id)
+  redis.call('DEL', record)
+  for _, folder in ipairs({ 'uploads/', 'results/' }) do
+    redis.call('ZADD', garbage, stamp(now + again), folder .. id .. '/')
+  end
+  redis.call('PUBLISH', prefix .. 'changed:' .. id, 'deleted')
+  return { 'ok', ticket }
+end
+
+return steps[step](unpack(ARGV, 3))
