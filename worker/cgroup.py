@@ -6,6 +6,7 @@ version 1 a tree for each. A limit of any group above ours binds us too, so the 
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,20 @@ MEMBERSHIP = Path("/proc/self/cgroup")
 
 _UNLIMITED_BYTES = 1 << 60
 """Version 1 has no word for 'none'; it gives the largest multiple of the page size."""
+
+
+def available_cores(root: Path = ROOT, membership: Path = MEMBERSHIP) -> int:
+    """Return how many cores this process can keep busy: by affinity and by CPU quota.
+
+    A fraction of a core is left out: BLAS threads wait for each other, so one that is throttled
+    holds up all.
+    """
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        cores = os.cpu_count() or 1
+    limit = cpu_limit(root, membership)
+    return cores if limit is None else max(1, min(cores, int(limit)))
 
 
 def cpu_limit(root: Path = ROOT, membership: Path = MEMBERSHIP) -> float | None:

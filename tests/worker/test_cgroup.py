@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 import pytest
 
-from worker.cgroup import cpu_limit, memory_limit, out_of_memory_kills
+from worker.cgroup import available_cores, cpu_limit, memory_limit, out_of_memory_kills
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -99,3 +100,16 @@ def test_system_without_control_groups(tmp_path: Path) -> None:
     absent = tmp_path / "absent"
     assert cpu_limit(tmp_path, absent) is None
     assert memory_limit(tmp_path, absent) is None
+
+
+@pytest.mark.parametrize(("quota", "most"), [("50000", 1), ("150000", 1), ("200000", 2)])
+def test_cores_that_a_quota_leaves(tmp_path: Path, quota: str, most: int) -> None:
+    lay(tmp_path, {"cpu.max": f"{quota} 100000\n"})
+    here = member(tmp_path, "0::/\n")
+    assert available_cores(tmp_path, here) == min(most, len(os.sched_getaffinity(0)))
+
+
+def test_a_wide_quota_does_not_make_cores(tmp_path: Path) -> None:
+    lay(tmp_path, {"cpu.max": "102400000 100000\n"})
+    here = member(tmp_path, "0::/\n")
+    assert available_cores(tmp_path, here) == len(os.sched_getaffinity(0))
