@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 from pydantic import AliasChoices, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -29,14 +28,11 @@ class Settings(BaseSettings):
         default=Path("smsr-data"),
         description="Folder of the embedded Redis server, of the objects and of scratch files.",
     )
-    redis_url: Annotated[
-        str | None,
-        Field(
-            default=None,
-            validation_alias=AliasChoices("SMSR_REDIS_URL", "REDIS_URL"),
-            description="redis://, rediss:// or unix:// address of Redis 6.2 or later.",
-        ),
-    ]
+    redis_url: str | None = Field(
+        default=None,
+        validation_alias=AliasChoices("SMSR_REDIS_URL", "REDIS_URL"),
+        description="redis://, rediss:// or unix:// address of Redis 6.2 or later.",
+    )
     storage_url: str | None = Field(
         default=None,
         description="Where inputs and results are kept: file:///folder or s3://bucket/prefix. "
@@ -115,10 +111,15 @@ class Settings(BaseSettings):
         """Number of BLAS threads of one worker."""
         return self.threads or max(1, available_cores() // self.workers)
 
+    def time_limit(self, asked: float | None) -> float:
+        """Return the seconds that a job may run which asked for some, or for nothing."""
+        return min(asked or self.job_timeout_seconds, self.job_timeout_seconds)
+
     def to_environ(self) -> dict[str, str]:
         """Return environment variables that give a subprocess the same settings."""
+        values = self.model_dump(mode="json") | {"data_dir": self.data_dir.resolve()}
         return {
             f"SMSR_{name.upper()}": str(value)
-            for name, value in self.model_dump(mode="json").items()
+            for name, value in values.items()
             if value is not None
         }
