@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from smsr.errors import InputError, NumericalFailure, SmsrError
 
@@ -29,6 +29,17 @@ class OutOfMemory(SmsrError):
 
     slug = "out-of-memory"
     title = "The job needs more memory than there is"
+
+    @classmethod
+    def budget(cls, limit: int | None) -> Self:
+        """Return the error of a job that went beyond its budget of `limit` bytes."""
+        if limit is None:
+            return cls("The worker has too little memory for these measurements.")
+        return cls(
+            f"A job may take {limit >> 20} MiB of memory here, and this one needs more. "
+            "Give fewer frames or points, or ask for workers with more memory.",
+            limit_bytes=limit,
+        )
 
 
 class WorkerLost(SmsrError):

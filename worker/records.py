@@ -32,6 +32,7 @@ FINAL: tuple[Status, ...] = ("succeeded", "failed", "cancelled")
 
 _DOCUMENTS = ("options", "inputs", "progress", "metrics", "timings", "problem")
 _PAGE_LIMIT = 1000
+_SCRIPT = resources.files("worker").joinpath("transitions.lua").read_text(encoding="utf-8")
 _WORKERS = f"{PREFIX}:workers"
 """Sorted set of the names of worker processes by their last sign of life."""
 
@@ -242,8 +243,7 @@ class RecordStore:
     def __init__(self, redis: Redis, *, result_ttl: float = 0) -> None:
         self.redis = redis
         self.result_ttl = result_ttl
-        source = resources.files("worker").joinpath("transitions.lua").read_text(encoding="utf-8")
-        self._script = redis.register_script(source)
+        self._script = redis.register_script(_SCRIPT)
 
     def _step(self, step: str, job_id: str, *arguments: str | float) -> Any:
         return self._script(keys=[PREFIX], args=[step, job_id, *arguments])

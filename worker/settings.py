@@ -7,10 +7,14 @@ from pathlib import Path
 from pydantic import AliasChoices, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from worker.cgroup import available_cores
+from worker.cgroup import available_cores, memory_limit
 
 GIBIBYTE = 1 << 30
 DAY = 86400
+
+_WORKER_BYTES = 192 << 20
+"""What a worker takes beside its job: the supervisor, the keeper and BLAS's buffers, measured."""
+_LEAST_BYTES = 64 << 20
 
 
 class Settings(BaseSettings):
@@ -66,6 +70,11 @@ class Settings(BaseSettings):
         default=None, ge=1, description="BLAS threads of a worker; without it cores / workers."
     )
 
+    job_memory_bytes: int | None = Field(
+        default=None,
+        gt=0,
+        description="Memory that one job may take; without it what the container or unit leaves.",
+    )
     max_attempts: int = Field(
         default=12, ge=1, description="Starts of a job whose workers keep dying before it fails."
     )
@@ -114,6 +123,14 @@ class Settings(BaseSettings):
     def time_limit(self, asked: float | None) -> float:
         """Return the seconds that a job may run which asked for some, or for nothing."""
         return min(asked or self.job_timeout_seconds, self.job_timeout_seconds)
+
+    @property
+    def memory_per_job(self) -> int | None:
+        """Bytes that a job may take, or None where nothing limits it."""
+        if self.job_memory_bytes is not None:
+            return self.job_memory_bytes
+        limit = memory_limit()
+        return None if limit is None else max(limit // self.workers - _WORKER_BYTES, _LEAST_BYTES)
 
     def to_environ(self) -> dict[str, str]:
         """Return environment variables that give a subprocess the same settings."""

@@ -34,7 +34,7 @@ from worker.problems import (
     TimeLimitExceeded,
     problem_document,
 )
-from worker.processes import raise_after
+from worker.processes import memory_budget, raise_after
 from worker.progress import AttemptOver, ProgressReporter
 from worker.queue import JobQueue
 from worker.records import RecordStore, Verdict, result_prefix
@@ -123,6 +123,7 @@ class _Attempt:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with (
+                memory_budget(self.settings.memory_per_job),
                 raise_after(limit, TimeLimitExceeded(limit)),
                 threadpool_limits(self.settings.threads_per_worker),
             ):
@@ -138,7 +139,7 @@ class _Attempt:
             self._discard()
             self._give_back(error)
         except MemoryError:
-            self._fail(OutOfMemory("The worker has too little memory for these measurements."))
+            self._fail(OutOfMemory.budget(self.settings.memory_per_job))
         except SmsrError as error:
             self._fail(error)
         except Exception:
