@@ -60,36 +60,38 @@ class Options:
     )
     virtual_points: int = option(
         64,
-        "Number of virtual points the measurements are reduced to before solving. The largest "
-        "singular directions are kept; what they do not span gets zero depth.",
+        "Number of virtual points that the measurements are reduced to before solving. The "
+        "strongest singular directions are kept; what they do not span gets zero depth.",
         minimum=4,
         maximum=4096,
     )
     camera_model: Literal["auto", "relaxed", "uniform", "paper"] = option(
         "auto",
         "How cameras are found: 'relaxed' by a convex problem, 'uniform' as a turn of constant "
-        "velocity, 'paper' by rank-3 thresholding; 'auto' as the preset says.",
+        "velocity, 'paper' by rank-3 thresholding. 'auto' is 'paper' in that preset; otherwise "
+        "'uniform' where it explains the relaxed cameras, else 'relaxed'.",
     )
     basis_size: int | None = option(
         None,
-        "Largest number K of basis shapes in the camera stage; null lets the method choose.",
+        "Number K of basis shapes in the camera stage; null leaves it to the method.",
         minimum=1,
         maximum=30,
     )
     camera_iterations: int = option(
-        600, "Most iterations of the camera stage.", minimum=1, maximum=100_000
+        500, "Most iterations of the camera stage.", minimum=1, maximum=100_000
     )
     camera_tolerance: float = option(
-        1e-7, "Relative change at which the camera stage stops.", minimum=1e-15, maximum=1.0
+        1e-6, "Relative residual at which the camera stage stops.", minimum=1e-15, maximum=1.0
     )
     smoothing: bool | None = option(
         None,
-        "Smooth the trajectories of the points before finding shapes; null as the preset says.",
+        "Replace the measurements by the nearest smooth motion before finding shapes. Null is on "
+        "in the preset 'paper' for up to 1000 points, as published, and off otherwise.",
     )
     smoothing_ratio: float = option(
         0.1,
-        "Number of cosine basis functions of the smoothing stage, as a part of the frames.",
-        minimum=0.01,
+        "Number of cosines in the smoothing stage, as a part of the number of frames.",
+        minimum=0.001,
         maximum=1.0,
     )
     smoothing_iterations: int = option(
@@ -98,8 +100,9 @@ class Options:
     shape_method: Literal["auto", "nuclear", "reweighted", "paper"] = option(
         "auto",
         "How shapes are found: 'nuclear' minimises the nuclear norm to convergence, 'reweighted' "
-        "a reweighted nuclear norm and the motion between frames, 'paper' uses the published "
-        "schedule; 'auto' as the preset and the camera model say.",
+        "a reweighted nuclear norm and the motion between frames, 'paper' follows the published "
+        "schedule of penalties. 'auto' is 'paper' in that preset; otherwise 'reweighted' with a "
+        "uniform camera, else 'nuclear'.",
     )
     shape_iterations: int = option(
         1000, "Most iterations of the shape stage.", minimum=1, maximum=100_000
@@ -109,9 +112,9 @@ class Options:
     )
     penalty: float = option(
         1.0,
-        "First penalty mu of the published shape stage, for measurements of unit variance.",
-        minimum=1e-6,
-        maximum=1e6,
+        "First penalty mu of the published shape stage, for measurements of unit spectral norm.",
+        minimum=1e-9,
+        maximum=1e9,
     )
     penalty_growth: float = option(
         1.02,
@@ -119,6 +122,42 @@ class Options:
         minimum=1.0,
         maximum=10.0,
     )
+    motion_weight: float = option(
+        1.5,
+        "Weight of least motion between frames in the reweighted shape stage.",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+
+
+_SPARSE_POINTS = 1000
+
+
+def resolve(options: Options, *, points: int) -> Options:
+    """Replace what is left to the preset by what the preset says.
+
+    Parameters
+    ----------
+    options : Options
+        As given.
+    points : int
+        N.
+
+    Returns
+    -------
+    Options
+        `smoothing` is True or False. `camera_model` and `shape_method` are 'auto' only where the
+        data decide.
+    """
+    published = options.preset == "paper"
+    changes: dict[str, Any] = {}
+    if options.smoothing is None:
+        changes["smoothing"] = published and points <= _SPARSE_POINTS
+    if published and options.camera_model == "auto":
+        changes["camera_model"] = "paper"
+    if published and options.shape_method == "auto":
+        changes["shape_method"] = "paper"
+    return dataclasses.replace(options, **changes)
 
 
 @dataclass(frozen=True, slots=True)

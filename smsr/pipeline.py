@@ -20,14 +20,16 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from smsr.cameras import estimate_cameras, fix_gauge
+from smsr.cautions import camera_cautions, convergence_cautions, input_cautions
 from smsr.errors import Cancelled
-from smsr.lifting import exact_lifting
+from smsr.lifting import exact_lifting, smoothed_lifting
 from smsr.measurements import as_source
-from smsr.options import Options, parse
+from smsr.options import Options, parse, resolve
 from smsr.progress import Progress
-from smsr.result import Caution, Diagnostics, Reconstruction, StageReport
+from smsr.result import Diagnostics, Reconstruction, StageReport
 from smsr.rowspace import factorise, map_back
-from smsr.shapes import low_rank_shapes
+from smsr.shapes import basis_size_of, estimate_shapes
+from smsr.trajectories import smooth_trajectories
 
 if TYPE_CHECKING:
     import os
@@ -35,10 +37,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from smsr.cameras import CameraEstimate
     from smsr.lifting import Lifting
     from smsr.measurements import MeasurementSource
     from smsr.progress import ProgressCallback, StageHook
+    from smsr.result import Caution
     from smsr.rowspace import RowSpace
+    from smsr.shapes import ShapeEstimate
+    from smsr.trajectories import SmoothMotion
 
 STAGES = ("reading", "factorising", "cameras", "smoothing", "shapes", "writing")
 """Names of the stages, in order."""
@@ -103,14 +109,14 @@ def reconstruct(
         space = factorise(source, progress=hook)
     # The matrices of the solver are small: threads of BLAS cost more than they bring.
     with threadpool_limits(limits=1, user_api="blas"):
-        solution = solve(space, options, clock)
+        solution = solve(space, resolve(options, points=space.points), clock)
     with clock.stage("writing") as hook:
         shapes = map_back(source, space, solution.lifting, out, progress=hook)
     result = Reconstruction(
         shapes=shapes,
         cameras=solution.cameras,
         translations=space.translations.copy(),
-        diagnostics=_diagnostics(options, space, solution, clock),
+        diagnostics=_diagnostics(resolve(options, points=space.points), space, solution, clock),
     )
     if out is not None:
         _write_rest(result, Path(out))
@@ -130,42 +136,73 @@ class Solution:
 
 
 def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
-    """Run the stages that do not depend on the number of points.
+    """Run the stages whose cost does not depend on the number of points.
 
     Parameters
     ----------
     space : RowSpace
         The factored measurements.
     options : Options
-        In force.
+        Resolved.
     clock : _Clock
         Receives the reports of the stages.
     """
-    # Penalties have a fixed scale: solve for measurements of unit variance.
-    scale = math.sqrt((space.singular_values**2).sum() / (2 * space.frames * space.points))
+    # Penalties have a fixed scale, so solve for measurements of unit spectral norm.
     kept = min(options.virtual_points, len(space.singular_values))
-    left, values = space.left[:, :kept], space.singular_values[:kept] / scale
+    left = space.left[:, :kept]
+    values = space.singular_values[:kept] / space.singular_values[0]
+    virtual = left * values
     with clock.stage("cameras") as hook:
         estimate = estimate_cameras(left, values, options, hook)
         rotations = fix_gauge(estimate.rotations)
-        clock.note(estimate.iterations, estimate.converged, estimate.reason, estimate.residuals)
+        clock.note(estimate)
+    with clock.stage("smoothing") as hook:
+        motion = _smooth(virtual, rotations, estimate.basis_size, options, hook)
+        if motion is not None:
+            virtual = motion.apply(virtual)
+            clock.note(motion)
     with clock.stage("shapes") as hook:
-        found = low_rank_shapes(
-            left * values,
-            rotations,
-            max_iterations=options.shape_iterations,
-            tolerance=options.shape_tolerance,
-            hook=hook,
-        )
-        clock.note(found.iterations, found.converged, found.reason, found.residuals)
+        found = estimate_shapes(virtual, rotations, options, camera_model=estimate.model, hook=hook)
+        clock.note(found)
     cameras = np.ascontiguousarray(rotations[:, :2])
+    if motion is None:
+        lifting = exact_lifting(found.shapes, cameras, left, values)
+    else:
+        lifting = smoothed_lifting(found.shapes, cameras, left, values, motion.basis)
+    published = estimate.model == "paper"
     return Solution(
         cameras=cameras,
-        lifting=exact_lifting(found.shapes, cameras, left, values),
-        basis_size=estimate.basis_size,
+        lifting=lifting,
+        basis_size=estimate.basis_size if published else basis_size_of(found.shapes),
         camera_model=estimate.model,
         camera_reason=estimate.reason,
-        cautions=(),
+        cautions=(
+            *input_cautions(space.singular_values, kept),
+            *camera_cautions(rotations),
+            *convergence_cautions(clock.reports),
+        ),
+    )
+
+
+def _smooth(
+    virtual: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    basis_size: int,
+    options: Options,
+    hook: StageHook,
+) -> SmoothMotion | None:
+    """Fit a smooth motion where that is asked for and can leave anything out."""
+    frames = len(rotations)
+    basis_size = min(basis_size, (min(2 * frames, virtual.shape[1]) - 1) // 3)
+    if not options.smoothing or basis_size < 1:
+        return None
+    return smooth_trajectories(
+        virtual,
+        rotations,
+        basis_size=basis_size,
+        cosines=min(frames, max(basis_size, math.ceil(options.smoothing_ratio * frames))),
+        max_iterations=options.smoothing_iterations,
+        hook=hook,
     )
 
 
@@ -194,17 +231,15 @@ class _Clock:
         last = self.reports[-1]
         hook(1.0, last.iterations, last.residuals[-1] if last.residuals else None)
 
-    def note(
-        self, iterations: int, converged: bool, reason: str, residuals: tuple[float, ...]
-    ) -> None:
+    def note(self, outcome: CameraEstimate | SmoothMotion | ShapeEstimate) -> None:
         """Add what the present stage did."""
-        step = -(-len(residuals) // _LISTED_RESIDUALS) or 1
+        step = -(-len(outcome.residuals) // _LISTED_RESIDUALS) or 1
         self.reports[-1] = dataclasses.replace(
             self.reports[-1],
-            iterations=iterations,
-            converged=converged,
-            reason=reason,
-            residuals=residuals[::-1][::step][::-1],
+            iterations=outcome.iterations,
+            converged=outcome.converged,
+            reason=outcome.reason,
+            residuals=outcome.residuals[::-1][::step][::-1],
         )
 
     def _report(self, stage: str, fraction: float, iteration: int, residual: float | None) -> None:

@@ -20,6 +20,7 @@ from smsr.proximal import singular_value_threshold, singular_values
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from smsr.options import Options
     from smsr.progress import StageHook
 
 
@@ -77,8 +78,9 @@ class DepthProblem:
         S <- the S with W = R S nearest to Z - Y (with lambda, the one of least motion near it)
         Y <- Y + S - Z
 
-    with over-relaxation, and with mu doubled or halved where one of the two residuals has run
-    ahead of the other (residual balancing), so that the result does not depend on the units.
+    with over-relaxation where the problem is convex, and with mu doubled or halved where one of
+    the two residuals has run ahead of the other (residual balancing), so that the result does not
+    depend on the units.
 
     Parameters
     ----------
@@ -88,25 +90,40 @@ class DepthProblem:
         Cameras completed by the viewing direction.
     """
 
+    FIRST_PENALTY = 30.0  # relative to 1 / sigma_1(P S#)
     RELAXATION = 1.6
     BALANCE_EVERY = 10
     BALANCE_RATIO = 5.0
 
     def __init__(self, measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> None:
         self.frames = len(rotations)
-        self.axis = np.ascontiguousarray(rotations[:, 2])
-        self.planar = planar_shapes(measurements, rotations)
-        self.shapes = self.planar.reshape(self.frames, -1)
-        self.dual = np.zeros_like(self.shapes)
+        self.measurements = measurements
         self.weights: NDArray[np.float64] | float = 1.0
         self.motion_weight = 0.0
         self.penalty = 0.0
         self.residuals: list[float] = []
-        # Tridiagonal D^T D seen by the depths, and its action on the planar part.
+        # Tridiagonal D^T D, as the depths see it once the cameras are known.
         self._diagonal = np.full(self.frames, 2.0)
         self._diagonal[[0, -1]] = 1.0
+        points = measurements.shape[1]
+        self._look_along(rotations, np.zeros((self.frames, points)))
+        self.dual = np.zeros_like(self.shapes)
+
+    def _look_along(self, rotations: NDArray[np.float64], depths: NDArray[np.float64]) -> None:
+        """Set cameras and depths (T, N)."""
+        self.rotations = rotations
+        self.axis = np.ascontiguousarray(rotations[:, 2])
+        self.planar = planar_shapes(self.measurements, rotations)
+        self.shapes = self._with_depths(depths)
         self._off_diagonal = -np.einsum("tj,tj->t", self.axis[:-1], self.axis[1:])
         self._planar_motion = self._along_axis(self._second_difference(self.planar))
+
+    def turn_to(self, rotations: NDArray[np.float64]) -> None:
+        """Change the cameras, keeping depths and multipliers as each camera sees them."""
+        depths = self._along_axis(self.shapes.reshape(self.frames, 3, -1))
+        seen = self.rotations @ self.dual.reshape(self.frames, 3, -1)
+        self._look_along(rotations, depths)
+        self.dual = (rotations.transpose(0, 2, 1) @ seen).reshape(self.frames, -1)
 
     def _second_difference(self, S: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return D^T D S."""
@@ -130,7 +147,8 @@ class DepthProblem:
         banded = np.zeros((2, self.frames))
         banded[1] = penalty + motion_weight * self._diagonal
         banded[0, 1:] = motion_weight * self._off_diagonal
-        return cholesky_banded(banded, check_finite=False)
+        factor: NDArray[np.float64] = cholesky_banded(banded, check_finite=False)
+        return factor
 
     def start_from_least_motion(self) -> None:
         """Set the depths that move the shape least from frame to frame."""
@@ -147,15 +165,37 @@ class DepthProblem:
         """Return ||D S#||_F^2."""
         return float((np.diff(self.shapes, axis=0) ** 2).sum())
 
-    def minimise(self, max_iterations: int, tolerance: float, hook: StageHook) -> bool:
+    def value(self) -> float:
+        """Return the present value of the objective."""
+        nuclear = float((self.weights * self.spectrum()).sum())
+        return nuclear + 0.5 * self.motion_weight * self.motion()
+
+    def camera_gradient(self) -> NDArray[np.float64]:
+        """Return the derivative (T, 3) of the minimum by turns ``G_t <- exp(phi_t) G_t``.
+
+        By the envelope theorem the shapes, being optimal, contribute nothing: only the multipliers
+        and the motion term see the cameras.
+        """
+        S = self.shapes.reshape(self.frames, 3, -1)
+        force = self.penalty * self.dual.reshape(S.shape)
+        force = force + self.motion_weight * self._second_difference(S)
+        force = self.rotations @ force
+        force[:, 2] = 0.0  # vanishes at the optimum: the depths are free
+        seen = self.rotations @ S
+        gradient: NDArray[np.float64] = np.cross(force, seen, axis=1).sum(axis=2)
+        return gradient
+
+    def minimise(self, max_iterations: int, tolerance: float, hook: StageHook = ignore) -> bool:
         """Iterate from the present state; return whether both residuals met the tolerance."""
         if self.penalty == 0.0:
-            self.penalty = 10.0 / max(float(self.spectrum()[0]), 1e-300)
+            self.penalty = self.FIRST_PENALTY / max(float(self.spectrum()[0]), np.finfo(float).tiny)
         S, Y = self.shapes, self.dual
         Z = S
         factor = self._banded_factor(self.penalty, self.motion_weight)
+        # Reweighting gives small singular values large weights, and over-relaxed steps may cycle.
+        relaxation = self.RELAXATION if np.ndim(self.weights) == 0 else 1.0
         for iteration in range(1, max_iterations + 1):
-            relaxed = self.RELAXATION * S + (1.0 - self.RELAXATION) * Z if iteration > 1 else S
+            relaxed = relaxation * S + (1.0 - relaxation) * Z
             X = relaxed + Y
             mean = X.mean(axis=0)
             Z, _ = singular_value_threshold(X - mean, self.weights / self.penalty)
@@ -166,7 +206,7 @@ class DepthProblem:
                 right = self.penalty * target - self.motion_weight * self._planar_motion
                 target = cho_solve_banded((factor, False), right, check_finite=False)
             previous, S = S, self._with_depths(target)
-            size = max(float(np.linalg.norm(S)), 1e-300)
+            size = max(float(np.linalg.norm(S)), np.finfo(float).tiny)
             primal = float(np.linalg.norm(S - Z)) / size
             dual = float(np.linalg.norm(S - previous)) / size
             self.residuals.append(max(primal, dual))
@@ -174,7 +214,9 @@ class DepthProblem:
             if self.residuals[-1] < tolerance:
                 break
             if iteration % self.BALANCE_EVERY == 0 and not (
-                1.0 / self.BALANCE_RATIO <= primal / max(dual, 1e-300) <= self.BALANCE_RATIO
+                1.0 / self.BALANCE_RATIO
+                <= primal / max(dual, np.finfo(float).tiny)
+                <= self.BALANCE_RATIO
             ):
                 change = 2.0 if primal > dual else 0.5
                 self.penalty *= change
@@ -184,12 +226,66 @@ class DepthProblem:
         return self.residuals[-1] < tolerance
 
 
+def estimate_shapes(
+    measurements: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    options: Options,
+    *,
+    camera_model: str,
+    hook: StageHook = ignore,
+) -> ShapeEstimate:
+    """Find the shapes of all frames in the way that the options ask for.
+
+    Parameters
+    ----------
+    measurements : ndarray of shape (2T, N)
+        W, centred, rows u1, v1, u2, ..., of unit spectral norm.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    options : Options
+        Resolved by `smsr.options.resolve`.
+    camera_model : str
+        How the cameras were found: least motion is asked for only where they cannot drift.
+    hook : callable
+        See `smsr.progress.StageHook`.
+    """
+    method = options.shape_method
+    if method == "auto":
+        method = "reweighted" if camera_model == "uniform" else "nuclear"
+    if method == "paper":
+        return published_shapes(
+            measurements,
+            rotations,
+            penalty=options.penalty,
+            penalty_growth=options.penalty_growth,
+            max_iterations=options.shape_iterations,
+            tolerance=options.shape_tolerance,
+            hook=hook,
+        )
+    if method == "reweighted":
+        return reweighted_shapes(
+            measurements,
+            rotations,
+            motion_weight=options.motion_weight,
+            max_iterations=options.shape_iterations,
+            tolerance=options.shape_tolerance,
+            hook=hook,
+        )
+    return low_rank_shapes(
+        measurements,
+        rotations,
+        max_iterations=options.shape_iterations,
+        tolerance=options.shape_tolerance,
+        hook=hook,
+    )
+
+
 def low_rank_shapes(
     measurements: NDArray[np.float64],
     rotations: NDArray[np.float64],
     *,
     max_iterations: int = 1000,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-4,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
     """Minimise the nuclear norm of P S# subject to W = R S, to convergence.
@@ -213,6 +309,149 @@ def low_rank_shapes(
     return _estimate(problem, converged)
 
 
+def published_shapes(
+    measurements: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    *,
+    penalty: float = 1.0,
+    penalty_growth: float = 1.02,
+    max_iterations: int = 1000,
+    tolerance: float = 1e-4,
+    hook: StageHook = ignore,
+) -> ShapeEstimate:
+    """Minimise the nuclear norm of P S# subject to W = R S by the published schedule.
+
+    The augmented Lagrangian ``||P S#||_* + <Y, W - R S> + mu/2 ||W - R S||_F^2`` is minimised by
+    a linearised step, from the planar structure R^+ W on:
+
+        S <- shrink(P(S + R^T (W - R S + Y / mu)), 1 / mu) + mean
+        Y <- Y + mu (W - R S),   mu <- rho mu
+
+    The penalty grows whatever the residuals do, so the result depends on the units of W and is not
+    the minimum that `low_rank_shapes` finds. What is left of W - R S goes into the image plane.
+
+    Parameters
+    ----------
+    measurements, rotations, max_iterations, hook
+        As for `low_rank_shapes`.
+    penalty : float
+        Mu.
+    penalty_growth : float
+        Rho.
+    tolerance : float
+        Bound on ``||W - R S|| / ||W||``.
+    """
+    frames = len(rotations)
+    cameras, W = rotations[:, :2], measurements.reshape(frames, 2, -1)
+    back = cameras.transpose(0, 2, 1)
+    S = back @ W
+    Y = np.zeros_like(W)
+    gap = W - cameras @ S
+    size = float(np.linalg.norm(W))
+    residuals: list[float] = []
+    for iteration in range(1, max_iterations + 1):
+        X = (S + back @ (gap + Y / penalty)).reshape(frames, -1)
+        mean = X.mean(axis=0)
+        low_rank, _ = singular_value_threshold(X - mean, 1.0 / penalty)
+        S = (low_rank + mean).reshape(S.shape)
+        gap = W - cameras @ S
+        Y += penalty * gap
+        penalty *= penalty_growth
+        residuals.append(float(np.linalg.norm(gap)) / size)
+        hook(iteration / max_iterations, iteration, residuals[-1])
+        if residuals[-1] < tolerance:
+            break
+    return ShapeEstimate(
+        shapes=S + back @ gap,
+        iterations=len(residuals),
+        converged=residuals[-1] < tolerance,
+        reason=f"residual {residuals[-1]:.1e} after {len(residuals)} iterations",
+        residuals=tuple(residuals),
+    )
+
+
+def reweighted_shapes(
+    measurements: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    *,
+    motion_weight: float = 1.5,
+    max_iterations: int = 1000,
+    tolerance: float = 1e-4,
+    hook: StageHook = ignore,
+) -> ShapeEstimate:
+    """Minimise a reweighted nuclear norm and the motion of the shape between frames.
+
+    Minimises ``sum_i log(sigma_i(P S#) + eps sigma_1) + lambda/2 ||D S#||_F^2`` subject to
+    W = R S by a few rounds of a weighted nuclear norm, w_i = 1 / (sigma_i + eps sigma_1). Lambda
+    scales itself: the more of the motion in the image is explained by the cameras, the more
+    weight has least motion of the shape. It needs exact cameras of an object that moves slower than
+    its camera turns.
+
+    Parameters
+    ----------
+    measurements, rotations, max_iterations, tolerance, hook
+        As for `low_rank_shapes`; the iterations of all rounds together are bounded.
+    motion_weight : float
+        Lambda relative to ``log(||D W||^2 / ||D S#||^2) ||P S#||_* / ||D S#||^2``.
+    """
+    problem = DepthProblem(measurements, rotations)
+    problem.start_from_least_motion()
+    converged = minimise_reweighted(
+        problem,
+        motion_weight=motion_weight,
+        rounds=_ROUNDS,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        hook=hook,
+    )
+    return _estimate(problem, converged)
+
+
+_ROUNDS = 6
+_ITERATIONS_PER_ROUND = 40
+_LOG_OFFSET = 0.05  # eps
+
+
+def minimise_reweighted(
+    problem: DepthProblem,
+    *,
+    motion_weight: float,
+    rounds: int,
+    max_iterations: int,
+    tolerance: float,
+    low_rank: bool = True,
+    hook: StageHook = ignore,
+) -> bool:
+    """Run the rounds of `reweighted_shapes` on a problem; `low_rank=False` keeps unit weights."""
+    image_motion = float(
+        (np.diff(problem.measurements.reshape(problem.frames, -1), axis=0) ** 2).sum()
+    )
+    tiny = np.finfo(float).tiny
+    converged = False
+    for index in range(rounds):
+        spectrum, motion = problem.spectrum(), max(problem.motion(), tiny)
+        nuclear = float(spectrum.sum())
+        gain = max(0.0, float(np.log(max(image_motion, tiny) / motion)))
+        problem.motion_weight = motion_weight * gain * nuclear / max(motion, 1e-12 * nuclear + tiny)
+        if low_rank and index > 0:
+            weights = 1.0 / (spectrum + _LOG_OFFSET * spectrum[0])
+            problem.weights = weights * (nuclear / float(weights @ spectrum))
+        last = index == rounds - 1
+        left = max_iterations - len(problem.residuals)
+        count = left if last else min(_ITERATIONS_PER_ROUND, left)
+        if count < 1:
+            break
+        first = index / rounds
+
+        def part(
+            fraction: float, iteration: int, residual: float | None, first: float = first
+        ) -> None:
+            hook(first + fraction / rounds, iteration, residual)
+
+        converged = problem.minimise(count, tolerance, part)
+    return converged
+
+
 def _estimate(problem: DepthProblem, converged: bool) -> ShapeEstimate:
     """Freeze what a solver has reached."""
     count = len(problem.residuals)
@@ -223,3 +462,18 @@ def _estimate(problem: DepthProblem, converged: bool) -> ShapeEstimate:
         reason=f"residual {problem.residuals[-1]:.1e} after {count} iterations",
         residuals=tuple(problem.residuals),
     )
+
+
+def basis_size_of(shapes: NDArray[np.float64], tolerance: float = 0.01) -> int:
+    """Return how many basis shapes span shapes (T, 3, N) up to a part of their norm.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (T, 3, N)
+        S.
+    tolerance : float
+        Part of ||S#||_F that may be left out.
+    """
+    squares = singular_values(shapes.reshape(len(shapes), -1)) ** 2
+    rest = np.cumsum(squares[::-1])[::-1]
+    return max(1, int((rest > tolerance**2 * rest[0]).sum()))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from smsr.cameras.constraints import orthonormality_form, symmetric_matrix, symmetric_vector
 from smsr.cameras.estimate import CameraEstimate, cameras_from_factor, scaled_motion, usable_rank
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from smsr.progress import StageHook
 
+_RELAXATION = 1.6
+
 
 def relaxed_cameras(
     left: NDArray[np.float64],
@@ -24,8 +26,8 @@ def relaxed_cameras(
     *,
     basis_size: int = 10,
     trace_weight: float = 1e-3,
-    max_iterations: int = 600,
-    tolerance: float = 1e-7,
+    max_iterations: int = 500,
+    tolerance: float = 1e-6,
     hook: StageHook = ignore,
 ) -> CameraEstimate:
     """Find the cameras by a convex problem: no start, no rank to guess, no bad minima.
@@ -34,9 +36,8 @@ def relaxed_cameras(
 
         1/2 sum_t || M'_t F M'_t^T - I_2 ||_F^2 + trace_weight T tr(F)
 
-    by accelerated proximal gradient steps with adaptive restart, then takes the three leading
-    eigenvectors of F. The trace, which on the cone is the nuclear norm, replaces the constraint
-    rank F = 3 (paper, Eq. 9).
+    by the alternating direction method, then takes the three leading eigenvectors of F. The trace,
+    which on the cone is the nuclear norm, replaces the constraint rank F = 3 (paper, Eq. 9).
 
     Parameters
     ----------
@@ -49,43 +50,79 @@ def relaxed_cameras(
     trace_weight : float
         Weight of the trace relative to the number of frames.
     max_iterations : int
-        Of the proximal gradient method.
+        Of the alternating direction method.
     tolerance : float
-        Relative change of F at which it stops.
+        Bound on both residuals, relative to ||F||, at which it stops.
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    frames = len(left) // 2
     n = usable_rank(values, 3 * basis_size)
     motion = scaled_motion(left, values, n)
-    form = orthonormality_form(motion, unit_scale=True)
-    step = 1.0 / form.lipschitz
-    F = np.zeros((n, n))
-    F[:3, :3] = np.eye(min(n, 3))
-    f = symmetric_vector(F)
-    ahead, momentum = f, 1.0
-    residuals: list[float] = []
-    for iteration in range(1, max_iterations + 1):
-        F = symmetric_matrix(ahead - step * form.gradient(ahead))
-        new = symmetric_vector(eigenvalue_threshold(F, trace_weight * frames * step))
-        moved = new - f
-        if (ahead - new) @ moved > 0.0:  # the momentum points uphill: restart
-            momentum, ahead = 1.0, new
-        else:
-            grown = (1.0 + math.sqrt(1.0 + 4.0 * momentum**2)) / 2.0
-            ahead, momentum = new + (momentum - 1.0) / grown * moved, grown
-        f = new
-        residuals.append(float(np.linalg.norm(moved) / max(float(np.linalg.norm(f)), 1e-300)))
-        hook(iteration / max_iterations, iteration, residuals[-1])
-        if residuals[-1] < tolerance:
-            break
-    converged = residuals[-1] < tolerance
+    F, residuals = relaxed_factor(
+        motion,
+        trace_weight=trace_weight,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        hook=hook,
+    )
     return CameraEstimate(
-        rotations=cameras_from_factor(motion, symmetric_matrix(f)),
+        rotations=cameras_from_factor(motion, F),
         model="relaxed",
         basis_size=-(-n // 3),
         iterations=len(residuals),
-        converged=converged,
-        reason=f"relative change {residuals[-1]:.1e} after {len(residuals)} iterations",
-        residuals=tuple(residuals),
+        converged=residuals[-1] < tolerance,
+        reason=f"residual {residuals[-1]:.1e} after {len(residuals)} iterations",
+        residuals=residuals,
     )
+
+
+def relaxed_factor(
+    motion: NDArray[np.float64],
+    *,
+    trace_weight: float = 1e-3,
+    max_iterations: int = 500,
+    tolerance: float = 1e-6,
+    hook: StageHook = ignore,
+) -> tuple[NDArray[np.float64], tuple[float, ...]]:
+    """Solve the convex problem of `relaxed_cameras` for F.
+
+    The splitting F = Z gives a linear system with one and the same matrix in every iteration and
+    an eigenvalue thresholding. The penalty equal to the weight of the trace thresholds eigenvalues
+    at 1, the size that F has for cameras of unit scale, and converges in some tens of iterations
+    where accelerated gradient steps need a thousand.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (2T, n)
+        M', see `smsr.cameras.estimate.scaled_motion`.
+    trace_weight, max_iterations, tolerance, hook
+        As for `relaxed_cameras`.
+
+    Returns
+    -------
+    F : ndarray of shape (n, n)
+        Semi-definite.
+    residuals : tuple of float
+        Stopping residual in each iteration.
+    """
+    frames, n = len(motion) // 2, motion.shape[1]
+    form = orthonormality_form(motion, unit_scale=True)
+    H, b = form.hessian / frames, form.linear / frames
+    penalty = trace_weight
+    system = cho_factor(H + penalty * np.eye(len(H)), check_finite=False)
+    z = symmetric_vector(np.diag((np.arange(n) < 3).astype(np.float64)))
+    u = np.zeros_like(z)
+    residuals: list[float] = []
+    for iteration in range(1, max_iterations + 1):
+        f = cho_solve(system, b + penalty * (z - u), check_finite=False)
+        x = _RELAXATION * f + (1.0 - _RELAXATION) * z + u
+        previous = z
+        z = symmetric_vector(eigenvalue_threshold(symmetric_matrix(x), trace_weight / penalty))
+        u = x - z
+        size = max(float(np.linalg.norm(z)), np.finfo(float).tiny)
+        primal, dual = np.linalg.norm(f - z) / size, np.linalg.norm(z - previous) / size
+        residuals.append(float(max(primal, dual)))
+        hook(iteration / max_iterations, iteration, residuals[-1])
+        if residuals[-1] < tolerance:
+            break
+    return symmetric_matrix(z), tuple(residuals)

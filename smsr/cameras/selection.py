@@ -1,19 +1,32 @@
-"""Which cameras to take."""
+"""Which cameras to take: free ones, unless a simpler motion explains them as well."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from smsr.cameras.paper import published_cameras
 from smsr.cameras.relaxed import relaxed_cameras
+from smsr.cameras.uniform import fit_uniform_turn, refine_uniform_turn, turning_cameras
 from smsr.progress import ignore
+from smsr.shapes import DepthProblem, minimise_reweighted
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from smsr.cameras.estimate import CameraEstimate
     from smsr.options import Options
     from smsr.progress import StageHook
+
+UNEXPLAINED_LIMIT = 0.15
+"""Part of the rotation variance of the free cameras that a uniform turn may leave unexplained."""
+
+ENERGY_LIMIT = 0.25
+"""Most that the logarithmic energy may rise from the free cameras to a uniform turn."""
 
 
 def estimate_cameras(
@@ -29,17 +42,123 @@ def estimate_cameras(
     left : ndarray of shape (2T, q)
         Left singular vectors of the centred measurements, rows u1, v1, u2, ...
     values : ndarray of shape (q,)
-        Singular values, largest first, of measurements of unit variance.
+        Singular values, largest first.
     options : Options
         Resolved by `smsr.options.resolve`.
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    return relaxed_cameras(
+    if options.camera_model == "paper":
+        return published_cameras(
+            left,
+            values,
+            basis_size=options.basis_size,
+            max_iterations=options.camera_iterations,
+            hook=hook,
+        )
+    free = relaxed_cameras(
         left,
         values,
         basis_size=options.basis_size or 10,
         max_iterations=options.camera_iterations,
         tolerance=options.camera_tolerance,
-        hook=hook,
+        hook=part_of(hook, 0.0, 0.5),
     )
+    if options.camera_model == "relaxed":
+        return free
+    forced = options.camera_model == "uniform"
+    return with_uniform_turn(free, left * values, part_of(hook, 0.5, 1.0), force=forced)
+
+
+def with_uniform_turn(
+    free: CameraEstimate,
+    measurements: NDArray[np.float64],
+    hook: StageHook = ignore,
+    *,
+    force: bool = False,
+) -> CameraEstimate:
+    """Return cameras of constant angular velocity where they explain the free ones, else those.
+
+    Parameters
+    ----------
+    free : CameraEstimate
+        Cameras without a motion model.
+    measurements : ndarray of shape (2T, N)
+        W, centred, rows u1, v1, u2, ...
+    hook : callable
+        See `smsr.progress.StageHook`.
+    force : bool
+        Take the uniform turn whatever it explains.
+    """
+    frames = len(free.rotations)
+    velocity, middle = fit_uniform_turn(free.rotations)
+    turn = turning_cameras(velocity, middle, frames)
+    unexplained = unexplained_rotation(free.rotations, turn)
+    if unexplained > UNEXPLAINED_LIMIT and not force:
+        reason = f"a uniform turn leaves {unexplained:.0%} of the rotation unexplained"
+        return dataclasses.replace(free, reason=f"{free.reason}; {reason}")
+    before = measure_energy(measurements, free.rotations)
+    after = measure_energy(measurements, turn)
+    rise = after.log_energy - before.log_energy
+    if rise > ENERGY_LIMIT and not force:
+        reason = f"a uniform turn raises the log energy by {rise:.2f}"
+        return dataclasses.replace(free, reason=f"{free.reason}; {reason}")
+    velocity = refine_uniform_turn(
+        measurements, velocity, middle, motion_weight=after.motion_weight, hook=hook
+    )
+    degrees = math.degrees(float(np.linalg.norm(velocity)))
+    return dataclasses.replace(
+        free,
+        rotations=turning_cameras(velocity, middle, frames),
+        model="uniform",
+        reason=f"{free.reason}; a uniform turn of {degrees:.2f} degrees a frame leaves "
+        f"{unexplained:.1%} of the rotation unexplained",
+    )
+
+
+def unexplained_rotation(rotations: NDArray[np.float64], model: NDArray[np.float64]) -> float:
+    """Return the part of the variance of rotations (T, 3, 3) that a model (T, 3, 3) leaves."""
+    variance = float(((rotations - rotations.mean(axis=0)) ** 2).sum())
+    return float(((rotations - model) ** 2).sum()) / max(variance, np.finfo(float).tiny)
+
+
+@dataclass(frozen=True, slots=True)
+class Energy:
+    """How simple the shapes are that some cameras allow.
+
+    Attributes
+    ----------
+    log_energy : float
+        ``(log ||P S#||_* + 1.5 log ||D S#||_F^2) / 4``, free of units up to a constant.
+    motion_weight : float
+        Weight lambda of the motion term.
+    """
+
+    log_energy: float
+    motion_weight: float
+
+
+def measure_energy(measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> Energy:
+    """Measure the best shapes (2T, N) for some cameras (T, 3, 3), roughly converged."""
+    problem = DepthProblem(measurements, rotations)
+    problem.start_from_least_motion()
+    minimise_reweighted(
+        problem,
+        motion_weight=1.5,
+        rounds=3,
+        max_iterations=140,
+        tolerance=2e-4,
+        low_rank=False,
+    )
+    nuclear = float(problem.spectrum().sum())
+    log_energy = math.log(nuclear + 1e-12) + 1.5 * math.log(problem.motion() + 1e-12)
+    return Energy(log_energy / 4.0, problem.motion_weight)
+
+
+def part_of(hook: StageHook, first: float, last: float) -> StageHook:
+    """Return a hook that reports into a part of another hook's range."""
+
+    def part(fraction: float, iteration: int, residual: float | None) -> None:
+        hook(first + fraction * (last - first), iteration, residual)
+
+    return part
