@@ -6,23 +6,21 @@ points") and give the same singular values, norms and iterates as on W. What is 
 pass over W that finds L (`factorise`) and one that writes the shapes ``S = A W`` (`map_back`).
 Both stream over chunks of points, so neither W nor S need fit in memory.
 
-L comes from a tall-skinny QR (Demmel, Grigori, Hoemmen, Langou: Communication-optimal parallel and
-sequential QR and LU factorizations, SIAM J. Sci. Comput. 34(1), 2012): the triangles of chunks of
-W^T are stacked and factored again. The Gram matrix W W^T would be cheaper, and would lose half of
-the digits of the small singular values.
+L comes from a tall-skinny QR: the triangles of chunks of W^T are stacked and factored again. The
+Gram matrix W W^T would be cheaper, and would lose half of the digits of the small singular values.
 """
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import chain
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from smsr.errors import InputError
+from smsr.mapping import Operator, Workspace, single_precision_serves
 from smsr.measurements import (
     CHUNK_BYTES,
     check_values,
@@ -31,11 +29,11 @@ from smsr.measurements import (
 )
 from smsr.progress import ignore
 from smsr.sinks import sink_for
-from smsr.streaming import blas_threads, checked_chunks, map_chunks, one_blas_thread
+from smsr.streaming import blas_threads, checked_chunks, few_blas_threads, map_chunks
+from smsr.triangles import NotUsableError, Triangle, merged, triangle_of
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -43,12 +41,7 @@ if TYPE_CHECKING:
     from smsr.measurements import MeasurementSource
     from smsr.progress import StageHook
 
-_CACHE_ENTRIES = 48 * 1024  # float64 entries that stay in a core's second-level cache
-_PRODUCT_ENTRIES = 512 * 1024
-_SMALL = 512  # up to this size more threads of BLAS only wait for each other
-_RANK_TOLERANCE = float(np.finfo(np.float64).eps)
-_SINGLE_EPS = float(np.finfo(np.float32).eps)
-_SINGLE_ERROR = 1e-6
+_EPS = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,21 +120,21 @@ def factorise(
     # anything is added or multiplied, and costs no digits.
     shift = np.array(first[1][:, 0], dtype=np.float64)
 
-    def work(_points: slice, block: NDArray[Any]) -> _Triangle:
-        return _triangle(block, shift)
+    def work(_points: slice, block: NDArray[Any]) -> Triangle:
+        return triangle_of(block, shift)
 
-    waiting: list[_Triangle] = []
+    waiting: list[Triangle] = []
     triangles = map_chunks(work, chain([first], chunks), workers or blas_threads())
     try:
         for index, (stop, triangle) in enumerate(triangles, 1):
             waiting.append(triangle)
             if sum(len(part.rows) for part in waiting) >= 8 * source.frames:
-                waiting = [_merged(waiting)]
+                waiting = [merged(waiting)]
             progress(stop / source.points, index, None)
-    except _NotUsableError:
+    except NotUsableError:
         check_values(source)
         raise _too_large() from None
-    return _row_space(_merged(waiting), shift, source)
+    return _row_space(merged(waiting), shift, source)
 
 
 def _factor_chunk(source: MeasurementSource, chunk_bytes: int) -> int:
@@ -150,81 +143,19 @@ def _factor_chunk(source: MeasurementSource, chunk_bytes: int) -> int:
     return max(chunk_points(source, chunk_bytes), worthwhile)
 
 
-class _NotUsableError(Exception):
-    """A block holds entries that are not finite, or overflow."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Triangle:
-    """What stays of some points: how many, their mean, and rows whose Gram matrix is theirs.
-
-    The mean is relative to a shift common to all, and the rows (k, 2T) are those of the points
-    about their mean, or a triangular factor of them.
-    """
-
-    count: int
-    mean: NDArray[np.float64]
-    rows: NDArray[np.float64]
-
-
-def _triangle(block: NDArray[Any], shift: NDArray[np.float64]) -> _Triangle:
-    """Reduce a block (2T, n), by parts that stay in cache."""
-    width, count = block.shape
-    step = max(4 * width, _CACHE_ENTRIES // width)
-    buffer = np.empty((width, min(step, count)))
-    parts = []
-    with np.errstate(invalid="ignore", over="ignore"):
-        for start in range(0, count, step):
-            columns = block[:, start : start + step]
-            centred = buffer[:, : columns.shape[1]]
-            np.subtract(columns, shift[:, None], out=centred)
-            mean = centred.mean(axis=1)
-            if not np.isfinite(mean).all():
-                raise _NotUsableError
-            centred -= mean[:, None]
-            parts.append(_Triangle(columns.shape[1], mean, _reduced(centred.T)))
-    return _merged(parts)
-
-
-def _reduced(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return at most as many rows as columns with the same Gram matrix."""
-    if rows.shape[0] <= rows.shape[1]:
-        return rows.copy()
-    return cast("NDArray[np.float64]", np.linalg.qr(rows, mode="r"))
-
-
-def _merged(parts: Iterable[_Triangle]) -> _Triangle:
-    """Join sets of points.
-
-    The rows of a set about the common mean are its rows about its own mean plus a constant. The
-    two are orthogonal, so the constant adds one row: the distance of the means times the root of
-    the number of points.
-    """
-    parts = list(parts)
-    if len(parts) == 1:
-        return parts[0]
-    count = sum(part.count for part in parts)
-    means = np.array([part.mean for part in parts])
-    counts = np.array([part.count for part in parts], dtype=np.float64)
-    mean = counts @ means / count
-    between = np.sqrt(counts)[:, None] * (means - mean)
-    rows = np.concatenate([part.rows for part in parts] + [between])
-    return _Triangle(count, mean, _reduced(rows))
-
-
-def _row_space(total: _Triangle, shift: NDArray[np.float64], source: MeasurementSource) -> RowSpace:
+def _row_space(total: Triangle, shift: NDArray[np.float64], source: MeasurementSource) -> RowSpace:
     """Turn the triangle of all points into the factor, by its singular value decomposition."""
     if not np.isfinite(total.rows).all():
         raise _too_large()
-    with one_blas_thread() if min(total.rows.shape) <= _SMALL else nullcontext():
+    with few_blas_threads(total.rows):
         _, values, right = np.linalg.svd(total.rows, full_matrices=False)
     means = shift + total.mean
     spread = float(np.linalg.norm(values)) / np.sqrt(2 * source.frames * source.points)
     single = np.dtype(source.dtype).kind == "f" and np.dtype(source.dtype).itemsize <= 4
     precision = np.finfo(source.dtype if single else np.float64).eps
-    if spread <= 4 * precision * float(np.abs(means).max()):
+    if spread <= precision * float(np.abs(means).max()):
         raise constant_measurements()
-    tolerance = _RANK_TOLERANCE * max(32, 2 * source.frames)
+    tolerance = _EPS * max(32, 2 * source.frames)
     rank = int(np.count_nonzero(values > tolerance * values[0]))
     left = right[:rank].T
     left *= np.sign(np.take_along_axis(left, np.abs(left).argmax(axis=0)[None], axis=0))
@@ -291,18 +222,14 @@ def map_back(
     For single-precision output the product runs in single precision where the rounding of the
     terms, known from A and L, stays below 1e-6 of the shapes; otherwise in double.
     """
-    frames, points = source.frames, source.points
-    sink = sink_for(out, frames, points, _result_dtype(source.dtype))
-    operator = _Operator.of(A)
-    if sink.dtype == np.float32:
-        _check_single_range(operator, rowspace)
-        if _single_precision_serves(operator, rowspace):
-            operator = operator.astype(np.dtype(np.float32))
+    points = source.points
+    sink = sink_for(out, source.frames, points, _result_dtype(source.dtype))
+    operator = _operator(A, rowspace, sink.dtype)
     size = min(points, chunk_points(source, chunk_bytes))
-    workers = workers or blas_threads()
-    spaces: SimpleQueue[_Workspace] = SimpleQueue()
+    workers = min(workers or blas_threads(), -(-points // size))
+    spaces: SimpleQueue[Workspace] = SimpleQueue()
     for _ in range(workers):
-        spaces.put(_Workspace(operator, size, sink.dtype))
+        spaces.put(Workspace(operator, size, sink.dtype))
 
     def work(points: slice, block: NDArray[Any]) -> None:
         space = spaces.get()
@@ -331,103 +258,18 @@ def _result_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype(np.float32 if narrow else np.float64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Operator:
-    """A as ``outer @ inner + R^T``, or as one matrix, in one precision."""
-
-    factors: tuple[NDArray[np.floating[Any]], ...]
-    cameras: NDArray[np.floating[Any]] | None
-
-    @classmethod
-    def of(cls, A: NDArray[np.float64] | Lifting) -> _Operator:
-        """Take the form of A with the least work for each point."""
-        if isinstance(A, np.ndarray):
-            return cls((A,), None)
-        frames, _, inside = A.outer.shape
-        # R^T on each frame is so thin a product that it takes as long as 85 terms of a fat one.
-        thin = 85 * frames * (A.cameras is not None)
-        if 6 * frames**2 <= 5 * frames * inside + thin:
-            return cls((A.matrix(),), None)
-        return cls((A.outer.reshape(3 * frames, inside), A.inner), A.cameras)
-
-    def astype(self, dtype: np.dtype[Any]) -> _Operator:
-        """Return the operator in another precision."""
-        cameras = None if self.cameras is None else self.cameras.astype(dtype)
-        return _Operator(tuple(factor.astype(dtype) for factor in self.factors), cameras)
-
-    def absolute(self) -> _Operator:
-        """Return the operator of absolute values, which bounds the rounding of the product."""
-        cameras = None if self.cameras is None else np.abs(self.cameras)
-        return _Operator(tuple(np.abs(factor) for factor in self.factors), cameras)
-
-    def __call__(
-        self,
-        columns: NDArray[np.floating[Any]],
-        buffers: Sequence[NDArray[np.floating[Any]]] | None = None,
-    ) -> NDArray[np.floating[Any]]:
-        """Apply to columns (2T, n); the result (3T, n) lies in the last of the buffers."""
-        result = columns
-        for position, factor in enumerate(reversed(self.factors)):
-            out = None if buffers is None else buffers[position][:, : columns.shape[1]]
-            result = np.matmul(factor, result, out=out)
-        if self.cameras is not None:
-            frames = len(self.cameras)
-            result.reshape(frames, 3, -1)[...] += self.cameras.transpose(0, 2, 1) @ columns.reshape(
-                frames, 2, -1
-            )
-        return result
-
-
-class _Workspace:
-    """Buffers of one thread, and what it does with them."""
-
-    def __init__(self, operator: _Operator, size: int, dtype: np.dtype[Any]) -> None:
-        precision = operator.factors[0].dtype
-        rows, columns = operator.factors[0].shape[0], operator.factors[-1].shape[1]
-        self.operator = operator
-        self.step = min(size, max(256, _PRODUCT_ENTRIES // (rows + columns)))
-        self.centred = np.empty((columns, self.step), precision)
-        self.products = [
-            np.empty((len(factor), self.step), precision) for factor in reversed(operator.factors)
-        ]
-        self.shapes = np.empty((rows // 3, size, 3), dtype)
-
-    def fill(
-        self,
-        target: NDArray[np.floating[Any]],
-        block: NDArray[Any],
-        means: NDArray[np.float64],
-    ) -> None:
-        """Put the shapes of a block (2T, n) into the target (T, n, 3)."""
-        frames = len(target)
-        for start in range(0, block.shape[1], self.step):
-            columns = block[:, start : start + self.step]
-            centred = self.centred[:, : columns.shape[1]]
-            # The difference is taken in double precision whatever it is stored in.
-            np.subtract(columns, means[:, None], out=centred, casting="same_kind")
-            axes = self.operator(centred, self.products).reshape(frames, 3, -1).transpose(1, 0, 2)
-            # Three strided copies: several times as fast as one assignment of the transpose.
-            np.stack(tuple(axes), axis=-1, out=target[:, start : start + self.step])
-
-
-def _row_norms(rowspace: RowSpace) -> NDArray[np.float64]:
-    """Return the norm of each row of the centred measurements, (2T, 1)."""
-    norms: NDArray[np.float64] = np.linalg.norm(rowspace.factor, axis=1, keepdims=True)
-    return norms
-
-
-def _single_precision_serves(operator: _Operator, rowspace: RowSpace) -> bool:
-    """Tell whether a single-precision product keeps the shapes to `_SINGLE_ERROR`.
-
-    Terms of a sum may be far larger than the sum, where A undoes a direction in which W is weak.
-    """
-    terms = float(np.linalg.norm(operator.absolute()(_row_norms(rowspace))))
-    shapes = float(np.linalg.norm(operator(rowspace.factor)))
-    return _SINGLE_EPS * terms <= _SINGLE_ERROR * shapes
-
-
-def _check_single_range(operator: _Operator, rowspace: RowSpace) -> None:
-    """Refuse shapes that would overflow single precision."""
-    largest = float(np.linalg.norm(operator(rowspace.factor), axis=1).max())
-    if largest > np.finfo(np.float32).max:
-        raise _too_large()
+def _operator(
+    A: NDArray[np.float64] | Lifting, rowspace: RowSpace, dtype: np.dtype[Any]
+) -> Operator:
+    """Return the map in the precision that the output needs."""
+    with few_blas_threads(rowspace.factor):
+        operator = Operator.of(A)
+        if dtype != np.float32:
+            return operator
+        rows = np.linalg.norm(rowspace.factor, axis=1)
+        shapes = np.linalg.norm(operator(rowspace.factor), axis=1)
+        if shapes.max() > np.finfo(np.float32).max:
+            raise _too_large()
+        if single_precision_serves(operator, rows, shapes):
+            operator = operator.astype(np.dtype(np.float32))
+        return operator

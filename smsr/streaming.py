@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
+_SMALL = 512
+
 
 @cache
 def _blas() -> ThreadpoolController:
@@ -42,6 +45,11 @@ def one_blas_thread() -> AbstractContextManager[object]:
     """Keep BLAS to one thread within a context."""
     limiter: AbstractContextManager[object] = _blas().limit(limits=1)
     return limiter
+
+
+def few_blas_threads(matrix: NDArray[Any]) -> AbstractContextManager[object]:
+    """Keep BLAS to one thread for work on a matrix so small that more wait for each other."""
+    return one_blas_thread() if min(matrix.shape) <= _SMALL else nullcontext()
 
 
 def map_chunks(
