@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
-_DATA_PAGES = 5  # field of /proc/self/statm, proc(5)
-
 _libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
 
@@ -147,32 +145,3 @@ def _become(parent: str, program: str, *arguments: str) -> None:
 
 if __name__ == "__main__":
     _become(*sys.argv[1:])
-
-
-@contextlib.contextmanager
-def memory_budget(budget: int | None) -> Iterator[None]:
-    """Make allocations in the body fail (`MemoryError`) that go beyond a budget; on Linux only.
-
-    Without it the kernel kills the process, or all of its container, where the memory ends. Counted
-    is private memory (RLIMIT_DATA, getrlimit(2)): mapped files do not count, as the kernel can take
-    their pages back.
-
-    Parameters
-    ----------
-    budget : int or None
-        Bytes beyond what the process has now; None sets no limit.
-    """
-    if budget is None or sys.platform != "linux":
-        yield
-        return
-    pages = Path("/proc/self/statm").read_text(encoding="ascii").split()
-    has = int(pages[_DATA_PAGES]) * resource.getpagesize()
-    former, most = resource.getrlimit(resource.RLIMIT_DATA)
-    limit = has + budget
-    if most != resource.RLIM_INFINITY:
-        limit = min(limit, most)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, most))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (former, most))

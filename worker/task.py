@@ -25,6 +25,7 @@ from smsr.metrics import as_shapes
 from smsr.options import parse
 from smsr.progress import Progress
 from worker.connections import connect
+from worker.memory import memory_budget
 from worker.options import JobOptions
 from worker.problems import (
     InputMissing,
@@ -34,7 +35,7 @@ from worker.problems import (
     TimeLimitExceeded,
     problem_document,
 )
-from worker.processes import memory_budget, raise_after
+from worker.processes import raise_after
 from worker.progress import AttemptOver, ProgressReporter
 from worker.queue import JobQueue
 from worker.records import RecordStore, Verdict, result_prefix
