@@ -1,13 +1,21 @@
 """Accuracy, time and memory on public evaluation sets, beside the published figures."""
 
 from smsr.benchmark.datasets import DATASETS, Dataset, load, select
-from smsr.benchmark.measure import Environment, Measurement, environment, measure, run
+from smsr.benchmark.measure import (
+    BenchmarkFailed,
+    Environment,
+    Measurement,
+    environment,
+    measure,
+    run,
+)
 from smsr.benchmark.published import METHODS, PUBLISHED, Figure, best_published
 
 __all__ = [
     "DATASETS",
     "METHODS",
     "PUBLISHED",
+    "BenchmarkFailed",
     "Dataset",
     "Environment",
     "Figure",

@@ -59,7 +59,7 @@ DATASETS: Final[tuple[Dataset, ...]] = (
     _mocap("stretch"),
     _mocap("yoga"),
     # The published figures of dinosaur compare in the camera frame; its ground truth is not there.
-    Dataset("dinosaur", "sparse/dinosaur.mat", {"object": "GT", "camera": "GT"}),
+    Dataset("dinosaur", "sparse/dinosaur.mat", {"object": "GT.shape3D", "camera": "GT.shape3D"}),
     Dataset("dance", "sparse/dance.mat", {"camera": "S"}),
     _mesh("facecap", "dense/facecap.npz"),
     _mesh("samba", "dense/samba.npz"),

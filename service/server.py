@@ -1,0 +1,60 @@
+"""Running the API with uvicorn on a socket that is bound already."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import uvicorn
+
+from service.app import create_app
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+
+    from worker.settings import Settings
+
+DRAIN_SECONDS = 5
+"""How long open requests, long polls above all, may still take when the server stops."""
+
+
+class _Server(uvicorn.Server):
+    """Uvicorn that tells when it is ready."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], object]) -> None:
+        super().__init__(config)
+        self._ready = ready
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        if self.started:
+            self._ready()
+
+
+def run_server(settings: Settings, listener: socket.socket, ready: Callable[[], object]) -> bool:
+    """Serve until SIGINT or SIGTERM, which uvicorn sends on to this process when it is done.
+
+    Parameters
+    ----------
+    settings : Settings
+        With a `redis_url`.
+    listener : socket
+        Bound.
+    ready : callable
+        Called once requests are answered.
+
+    Returns
+    -------
+    bool
+        False where the service could not start; the log says why.
+    """
+    config = uvicorn.Config(
+        create_app(settings),
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=DRAIN_SECONDS,
+    )
+    server = _Server(config, ready)
+    server.run(sockets=[listener])
+    return server.started
