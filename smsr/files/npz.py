@@ -198,7 +198,7 @@ def _inflate(archive: zipfile.ZipFile, info: zipfile.ZipInfo, header: NpyHeader)
         raise _damaged(error) from None
     if filled < len(target):
         raise UnreadableFile("The .npz file holds less data than its header says.")
-    return target.view(header.dtype).reshape(header.shape, order=header.order)
+    return target.view(np.dtype(header.dtype)).reshape(header.shape, order=header.order)
 
 
 def _read_up_to(member: IO[bytes], size: int) -> bytes:

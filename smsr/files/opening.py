@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from smsr.errors import TooLarge
 from smsr.files.formats import HEAD_BYTES, FileFormat, sniff
+from smsr.files.hdf5 import open_hdf5
 from smsr.files.mat5 import open_mat5
 from smsr.files.npy import open_npy
 from smsr.files.npz import open_npz
 from smsr.files.selection import Role, StoredArray, check_chosen, select
+from smsr.files.text import open_text, open_text_gz
 
 if TYPE_CHECKING:
     import os
@@ -26,6 +28,9 @@ _OPENERS: dict[FileFormat, Callable[[Path, int], AbstractContextManager[list[Sto
     FileFormat.NPY: open_npy,
     FileFormat.NPZ: open_npz,
     FileFormat.MAT5: open_mat5,
+    FileFormat.HDF5: open_hdf5,
+    FileFormat.TEXT: open_text,
+    FileFormat.TEXT_GZ: open_text_gz,
 }
 
 
