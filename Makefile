@@ -1,9 +1,11 @@
 # Each target calls the script of its name in scripts/, which makes .venv and installs what is missing.
-.PHONY: help install demo test lint format benchmark pictures clean
+.PHONY: help install demo test test-containers lock lint format benchmark pictures clean
 
 help:
 	@echo "make demo       run the whole service on a generated example; results in demo-output/"
 	@echo "make test       run every test"
+	@echo "make test-containers  build the image, run the cluster and break it (needs a Docker Engine)"
+	@echo "make lock       pin the image's dependencies anew (docker/*.lock)"
 	@echo "make lint       style, format and types (make format mends what it can)"
 	@echo "make benchmark  the accuracy table, on the data in SMSR_DATA or ../shared/data"
 	@echo "make pictures   draw the pictures of the documentation again"
@@ -18,6 +20,12 @@ demo:
 
 test:
 	@scripts/test
+
+test-containers:
+	@scripts/test-containers
+
+lock:
+	@scripts/lock
 
 lint:
 	@scripts/check
