@@ -226,6 +226,29 @@ def as_source(
     return source
 
 
+def check_shape(
+    shape: tuple[int, ...], dtype: np.dtype[Any], layout: Layout = "auto"
+) -> tuple[int, int]:
+    """Return T and N of an array that has not been read, refusing what `as_source` would.
+
+    Parameters
+    ----------
+    shape : tuple of int
+    dtype : dtype
+    layout : {"auto", "interleaved", "stacked"}
+        As in `as_source`.
+
+    Raises
+    ------
+    NotNumeric, WrongShape, OddRowCount, AmbiguousLayout, TooFewFrames, TooFewPoints
+    """
+    _check_dtype(dtype)
+    # A broadcast zero has any shape and takes no memory.
+    source = ArraySource(_tracks(np.broadcast_to(np.zeros((), dtype), shape), layout))
+    _check_size(source.frames, source.points)
+    return source.frames, source.points
+
+
 def chunk_points(source: MeasurementSource, chunk_bytes: int = CHUNK_BYTES) -> int:
     """Return how many points make a chunk of about `chunk_bytes` (at least 1)."""
     return max(1, chunk_bytes // (2 * source.frames * np.dtype(source.dtype).itemsize))

@@ -1,17 +1,27 @@
 """Reading measurement, ground-truth and face files; writing results."""
 
-from smsr.files.formats import FileFormat, sniff
+from smsr.files.faces import load_faces
+from smsr.files.formats import HEAD_BYTES, FileFormat, sniff
 from smsr.files.npy import npy_header
 from smsr.files.npz import write_npz
 from smsr.files.opening import DEFAULT_LIMIT, open_array
+from smsr.files.ply import ply_face_block, ply_header, write_ply
+from smsr.files.prefix import Beginning, check_prefix
 from smsr.files.selection import Role
 
 __all__ = [
     "DEFAULT_LIMIT",
+    "HEAD_BYTES",
+    "Beginning",
     "FileFormat",
     "Role",
+    "check_prefix",
+    "load_faces",
     "npy_header",
     "open_array",
+    "ply_face_block",
+    "ply_header",
     "sniff",
     "write_npz",
+    "write_ply",
 ]

@@ -66,6 +66,8 @@ def sniff(head: bytes, name: str) -> FileFormat:
         raise EmptyFile(f"{name} is empty.")
     if head.startswith(b"\x93NUMPY"):
         return FileFormat.NPY
+    if head.startswith(b"PK\x03\x04") and b"[Content_Types].xml" in head[:256]:
+        raise UnsupportedFormat(f"{name} is an Office document; save the table as .csv.")
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return FileFormat.NPZ
     if any(head.startswith(_HDF5_SIGNATURE, at) for at in (0, 512, 1024, 2048, 4096)):

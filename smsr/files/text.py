@@ -37,6 +37,7 @@ _TRUSTED = 4 * 2**20
 """Numbers in text do not compress a hundredfold; more than that, past the first bytes, is a
 decompression bomb."""
 
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _SEPARATORS = (b";", b",", b"\t")
 _EMPTY = {mark: re.compile(rb"(^|%b) *(?=%b|$)" % (mark, mark)) for mark in _SEPARATORS}
 _NUMBER = re.compile(
@@ -55,6 +56,32 @@ def open_text(path: Path, limit: int) -> Iterator[list[StoredArray]]:
 def open_text_gz(path: Path, limit: int) -> Iterator[list[StoredArray]]:
     """Find the one table of a text file compressed by gzip."""
     yield [_stored(path, limit, compressed=True)]
+
+
+def check_text(head: bytes, *, complete: bool) -> None:
+    """Refuse a text file whose first row holds no numbers.
+
+    Parameters
+    ----------
+    head : bytes
+        Its beginning.
+    complete : bool
+        Whether that is all of it.
+    """
+    lines = head.removeprefix(_BYTE_ORDER_MARK).split(b"\n")
+    named = False
+    for number, line in enumerate(lines if complete else lines[:-1], 1):
+        line = line.split(b"#", 1)[0].rstrip(b"\r")
+        if not line.strip():
+            continue
+        fields = _fields(line, _separator(line))
+        if not named and all(_NAME.match(field) for field in fields):
+            named = True
+            continue
+        _check_fields(fields, number)
+        return
+    if complete:
+        raise UnreadableFile("The text file holds no numbers.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +132,7 @@ class _Lines:
                         f"of measurements does."
                     )
             if number == 1:
-                line = line.removeprefix(b"\xef\xbb\xbf")
+                line = line.removeprefix(_BYTE_ORDER_MARK)
             line = line.split(b"#", 1)[0].rstrip(b"\r\n")
             if b"\r" in line:
                 raise UnreadableFile("The text file ends its lines by a lone carriage return.")
@@ -186,14 +213,7 @@ def _numbers(block: list[tuple[int, bytes]], separator: bytes | None) -> NDArray
         return np.loadtxt(completed, np.float64, comments=None, delimiter=delimiter, ndmin=2)
     except ValueError as error:
         for number, line in block:
-            for field in _fields(line, separator):
-                if field and not _NUMBER.fullmatch(field):
-                    shown = field[:40].decode("latin1")
-                    raise NotNumeric(
-                        f"{shown!r} in line {number} is no number. Fields must be numbers with a "
-                        f"decimal point.",
-                        line=number,
-                    ) from None
+            _check_fields(_fields(line, separator), number)
         raise UnreadableFile(f"After line {block[0][0]}: {error}.") from None
 
 
@@ -206,6 +226,17 @@ def _separator(line: bytes) -> bytes | None:
 
 def _fields(line: bytes, separator: bytes | None) -> list[bytes]:
     return [field.strip() for field in line.split(separator)]
+
+
+def _check_fields(fields: list[bytes], number: int) -> None:
+    for field in fields:
+        if field and not _NUMBER.fullmatch(field):
+            shown = field[:40].decode("latin1")
+            raise NotNumeric(
+                f"{shown!r} in line {number} is no number. Fields must be numbers with a decimal "
+                f"point.",
+                line=number,
+            )
 
 
 def _completed(line: bytes, separator: bytes | None) -> bytes:
