@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("smsr", "worker", "service")
 
-SOLVER_LIBRARIES = {"numpy", "scipy", "threadpoolctl", "h5py", "plyfile"}
+SOLVER_LIBRARIES = {"numpy", "scipy", "threadpoolctl", "h5py"}
 WEB_LIBRARIES = {"fastapi", "starlette", "uvicorn", "httpx", "typer", "rich", "multipart"}
 
 
