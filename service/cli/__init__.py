@@ -1,0 +1,55 @@
+"""The command line ``smsr``: reconstruct here, serve, or talk to a server."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import smsr
+from service.cli import benchmark, demo, local, remote, serve
+from service.cli.exits import EXPECTED, HELP, console, leave
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=HELP,
+)
+
+app.command()(local.reconstruct)
+app.command()(local.evaluate)
+app.command()(local.options)
+app.command()(local.example)
+app.command()(remote.submit)
+app.add_typer(remote.jobs, name="jobs")
+app.command()(serve.serve)
+app.command()(serve.worker)
+app.command()(demo.demo)
+app.command()(benchmark.benchmark)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        console.print(f"smsr {smsr.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def top(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and leave."
+        ),
+    ] = False,
+) -> None:
+    """Reconstruct moving 3D surfaces from 2D point tracks of one camera."""
+
+
+def main() -> None:
+    """Run the command line; expected errors end it with one line and an exit code."""
+    try:
+        app(prog_name="smsr")
+    except EXPECTED as error:
+        leave(error)

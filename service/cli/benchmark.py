@@ -1,0 +1,163 @@
+"""The command that measures accuracy, time and memory on the evaluation sets."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from service.cli.bars import progress_bars
+from service.cli.exits import console
+from service.cli.local import AsJson, OptionValues, Preset, preset_and_options
+from smsr.benchmark import (
+    DATASETS,
+    METHODS,
+    PUBLISHED,
+    best_published,
+    environment,
+    run,
+    select,
+)
+from smsr.options import Options, parse
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from smsr.benchmark import Dataset, Environment, Figure, Measurement
+
+MEBIBYTE = 1 << 20
+OURS = "this code"
+
+
+def benchmark(
+    data: Annotated[
+        Path,
+        typer.Option(
+            exists=True,
+            file_okay=False,
+            envvar="SMSR_DATA",
+            metavar="DIR",
+            help="Folder with sparse/*.mat and dense/*.npz.",
+            show_default=False,
+        ),
+    ],
+    sets: Annotated[
+        str | None,
+        typer.Option(metavar="NAMES", help="Comma-separated sets, or .npz files. [default: all]"),
+    ] = None,
+    preset: Preset = None,
+    option: OptionValues = None,
+    threads: Annotated[int, typer.Option(min=1, help="BLAS threads.")] = 1,
+    as_json: AsJson = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown tables.")] = False,
+) -> None:
+    """Measure e3D, wall time and peak memory on each set, beside the published figures.
+
+    Each set runs in a process of its own, one after the other.
+    """
+    values = preset_and_options(Options, preset, option)
+    parse(Options, values)
+    chosen = DATASETS if sets is None else select(name.strip() for name in sets.split(","))
+    measured = []
+    with progress_bars() as bars:
+        bar = bars.add_task("measuring", total=len(chosen), stage="")
+        for dataset in chosen:
+            bars.update(bar, stage=dataset.name)
+            measured.append(run(dataset, data, options=values, threads=threads))
+            bars.advance(bar)
+    where = environment(threads)
+    if as_json:
+        console.print_json(
+            data={
+                "environment": dataclasses.asdict(where),
+                "options": values,
+                "sets": [dataclasses.asdict(one) for one in measured],
+            }
+        )
+        return
+    accuracy, cost = accuracy_rows(chosen, measured), cost_rows(measured)
+    if markdown:
+        text = "\n\n".join((_markdown(accuracy), _markdown(cost), footnote(where)))
+        console.print(text, markup=False, soft_wrap=True)
+        return
+    console.print(_table(accuracy))
+    console.print(_table(cost))
+    console.print(footnote(where), style="dim")
+    for method, source in METHODS.items():
+        console.print(f"{method}: {source}", style="dim")
+
+
+def accuracy_rows(datasets: Sequence[Dataset], measured: Sequence[Measurement]) -> list[list[str]]:
+    """Return e3D of every method on every set; the first row names the sets."""
+    rows = [["e3D", *(one.name for one in measured)]]
+    for method, figures in PUBLISHED.items():
+        cells = [_published(figures, one.name) for one in measured]
+        if any(cells):
+            rows.append([method, *cells])
+    for frame in ("object", "camera"):
+        cells = [_number(one.e3d.get(frame)) for one in measured]
+        rows.append([f"{OURS}, {frame} frame", *cells])
+    own = [_number(one.e3d_per_frame[d.frame]) for d, one in zip(datasets, measured, strict=True)]
+    rows.append([f"{OURS}, each frame aligned", *own])
+    return rows
+
+
+def cost_rows(measured: Sequence[Measurement]) -> list[list[str]]:
+    """Return size, time and memory of every set; the first row is the heading."""
+    head = ["set", "T", "N", "K", "camera", "seconds", "peak MiB", "of it at start", "converged"]
+    return [head] + [
+        [
+            one.name,
+            str(one.frames),
+            f"{one.points:,}",
+            str(one.basis_size),
+            one.camera_model,
+            f"{one.seconds:.2f}",
+            f"{one.peak_bytes / MEBIBYTE:.0f}",
+            f"{one.start_bytes / MEBIBYTE:.0f}",
+            "yes" if one.converged else "no",
+        ]
+        for one in measured
+    ]
+
+
+def footnote(where: Environment) -> str:
+    """Say what the figures were measured with."""
+    return (
+        f"smsr {where.smsr}, Python {where.python}, NumPy {where.numpy}, SciPy {where.scipy}, "
+        f"{where.blas} on {where.blas_threads} thread(s), {where.machine} with {where.processors} "
+        "processors. Seconds are wall time of the reconstruction, writing included; peak memory is "
+        "that of its process, mapped files included."
+    )
+
+
+def _published(figures: Mapping[str, Figure], name: str) -> str:
+    if name not in figures:
+        return ""
+    figure = figures[name]
+    best = best_published(name)
+    text = _number(figure.e3d) + (f" ({figure.basis_size})" if figure.basis_size else "")
+    return f"{text} *" if best is not None and figure.e3d == best[1] else text
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> Table:
+    head, *body = rows
+    table = Table(header_style="bold")
+    for column, name in enumerate(head):
+        table.add_column(name, justify="left" if column == 0 else "right")
+    for row in body:
+        table.add_row(*row, style="bold" if row[0].startswith(OURS) else None)
+    return table
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> str:
+    head, *body = rows
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in body])

@@ -1,0 +1,251 @@
+"""Commands that need no server: reconstruct, evaluate, options, example."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.padding import Padding
+from rich.table import Table
+
+import smsr
+from service.cli import option_values
+from service.cli.bars import SolverBar, progress_bars
+from service.cli.exits import console, errors
+from smsr.files import load_faces, open_array, write_npz, write_ply
+from smsr.measurements import as_source
+from smsr.metrics import Frame, as_shapes
+from smsr.options import OptionDescription, Options, describe, parse
+from smsr.result import Diagnostics, Reconstruction
+from smsr.synthetic import write_example
+from worker.options import JobOptions
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smsr.metrics import Evaluation
+
+InputFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, show_default=False)]
+OptionalFile = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, metavar="FILE")]
+OptionValues = Annotated[
+    list[str] | None,
+    typer.Option(
+        "-O", "--option", metavar="NAME=VALUE", help="An option, see smsr options; repeatable."
+    ),
+]
+Preset = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Short for -O preset=NAME: default or paper.")
+]
+FrameOfTruth = Annotated[Frame, typer.Option(help="Frame that the ground truth is given in.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def preset_and_options(
+    cls: type, preset: str | None, assignments: list[str] | None
+) -> dict[str, object]:
+    """Return option values by name; -O wins over --preset."""
+    values: dict[str, object] = {} if preset is None else {"preset": preset}
+    return values | option_values.read(cls, assignments or [])
+
+
+def reconstruct(
+    file: InputFile,
+    ground_truth: OptionalFile = None,
+    faces: OptionalFile = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Folder of the result. [default: FILE-3d]"),
+    ] = None,
+    preset: Preset = None,
+    key: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The measurements' name within FILE.")
+    ] = None,
+    ground_truth_key: Annotated[str | None, typer.Option(metavar="NAME")] = None,
+    faces_key: Annotated[str | None, typer.Option(metavar="NAME")] = None,
+    frame: FrameOfTruth = "auto",
+    option: OptionValues = None,
+    ply: Annotated[bool, typer.Option(help="Write a PLY of every frame.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Reconstruct the surface from 2D tracks, on this machine.
+
+    Writes result.npz, report.json and frames/frame_0000.ply, ... into the folder; with ground truth
+    it tells the error e3D.
+    """
+    options = parse(Options, preset_and_options(Options, preset, option))
+    # All inputs are checked before the work begins.
+    source = as_source(open_array(file, key=key), options.layout)
+    truth = triangles = None
+    if ground_truth is not None:
+        truth = open_array(ground_truth, key=ground_truth_key, role="ground_truth")
+        truth = as_shapes(truth, source.frames, source.points)
+    if faces is not None:
+        triangles = load_faces(faces, source.points, key=faces_key)
+    target = out or Path(f"{file.stem}-3d")
+    target.mkdir(parents=True, exist_ok=True)
+
+    # The arrays are views of files in the scratch folder: all is written before it goes.
+    with (
+        tempfile.TemporaryDirectory(dir=target, prefix=".arrays-") as scratch,
+        progress_bars() as bars,
+    ):
+        bar = SolverBar(bars, file.name)
+        result = smsr.reconstruct(source, out=scratch, progress=bar, options=options)
+        bar.finish()
+        error = None if truth is None else smsr.evaluate(truth, result, frame=frame)
+        report = result.diagnostics.to_dict()
+        report["metrics"] = None if error is None else error.to_dict()
+        _write(target, result, triangles, report, ply=ply)
+    if as_json:
+        console.print_json(data=report)
+    else:
+        _tell(target, result.diagnostics, error)
+
+
+def evaluate(
+    ground_truth: InputFile,
+    result: Annotated[
+        Path,
+        typer.Argument(exists=True, dir_okay=False, show_default=False, metavar="RESULT.npz"),
+    ],
+    key: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The ground truth's name within its file.")
+    ] = None,
+    frame: FrameOfTruth = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Measure the error of a result against ground truth."""
+    truth = open_array(ground_truth, key=key, role="ground_truth")
+    error = smsr.evaluate(truth, _read_result(result), frame=frame)
+    if as_json:
+        console.print_json(data=error.to_dict())
+    else:
+        console.print(_error_table(error))
+
+
+def options(
+    as_json: AsJson = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print a Markdown table.")] = False,
+) -> None:
+    """List every option: type, default, range, help."""
+    described = describe(JobOptions)
+    if as_json:
+        console.print_json(
+            data=[{name: getattr(what, name) for name in what.__slots__} for what in described]
+        )
+    elif markdown:
+        console.print(options_markdown(described), markup=False, soft_wrap=True, end="")
+    else:
+        for what in described:
+            name, kind, default, span, meaning = _cells(what)
+            facts = span if what.choices else ", ".join(filter(None, (kind, span)))
+            console.print(f"[bold]{name}[/] = {default}  [dim]({facts})[/]")
+            console.print(Padding(meaning, (0, 0, 0, 4)))
+
+
+def example(
+    folder: Annotated[Path, typer.Argument(file_okay=False, metavar="DIR", show_default=False)],
+    frames: Annotated[int, typer.Option(min=3, help="Number of frames.")] = 60,
+    side: Annotated[int, typer.Option(min=3, help="Points along a side of the grid.")] = 40,
+    seed: Annotated[int, typer.Option(help="Chooses the expressions and the camera's path.")] = 0,
+) -> None:
+    """Write a generated example: a talking mask, filmed by a camera that swings around it."""
+    made = write_example(folder, frames=frames, side=side, seed=seed)
+    points = made.ground_truth.shape[1]
+    console.print(
+        f"Wrote measurements.npy, ground_truth.npy and faces.npy ({frames} frames of {points} "
+        f"points) to {folder}",
+        soft_wrap=True,
+    )
+
+
+def options_markdown(described: tuple[OptionDescription, ...]) -> str:
+    """Return the table of the options as it stands in the README."""
+    lines = ["| option | type | default | range | meaning |", "|---|---|---|---|---|"]
+    for what in described:
+        name, kind, default, span, meaning = _cells(what)
+        lines.append(f"| `{name}` | {kind} | {default} | {span} | {meaning} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cells(what: OptionDescription) -> tuple[str, str, str, str, str]:
+    default = json.dumps(what.default) if what.type != "string" else str(what.default or "none")
+    low, high = what.minimum, what.maximum
+    if what.choices is not None:
+        span = ", ".join(what.choices)
+    elif low is not None and high is not None:
+        span = f"{low:g} to {high:g}"
+    elif low is not None:
+        span = f"at least {low:g}"
+    else:
+        span = "" if high is None else f"at most {high:g}"
+    default = "none" if what.default is None else default
+    return what.name, what.type, default, span, what.help
+
+
+def _write(
+    target: Path,
+    result: Reconstruction,
+    faces: NDArray[Any] | None,
+    report: dict[str, Any],
+    *,
+    ply: bool,
+) -> None:
+    arrays = {
+        "shapes": result.shapes,
+        "cameras": result.cameras,
+        "translations": result.translations,
+    }
+    write_npz(target / "result.npz", arrays if faces is None else {**arrays, "faces": faces})
+    (target / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    if ply:
+        (target / "frames").mkdir(exist_ok=True)
+        for t, shape in enumerate(result.shapes):
+            write_ply(target / "frames" / f"frame_{t:04d}.ply", shape, faces)
+
+
+def _read_result(path: Path) -> Reconstruction:
+    """Open a result.npz; how it came about is not in it."""
+    # Under a key that is named, an array of any shape is opened.
+    shapes, cameras, translations = (
+        open_array(path, key=name, role="ground_truth")
+        for name in ("shapes", "cameras", "translations")
+    )
+    unknown = Diagnostics(
+        options=Options(),
+        frames=shapes.shape[0],
+        points=shapes.shape[1],
+        basis_size=0,
+        camera_model="unknown",
+        camera_reason="read from a file",
+        converged=True,
+        stages=(),
+        singular_values=(),
+    )
+    return Reconstruction(shapes, cameras, translations, unknown)
+
+
+def _tell(target: Path, found: Diagnostics, error: Evaluation | None) -> None:
+    seconds = sum(found.seconds.values())
+    console.print(
+        f"{found.frames} frames of {found.points} points in {seconds:.1f} s, K = "
+        f"{found.basis_size}, {found.camera_model} camera: {target}",
+        soft_wrap=True,
+    )
+    if error is not None:
+        console.print(_error_table(error))
+    for caution in found.cautions:
+        errors.print(f"[yellow]Caution[/] ({caution.code}): {caution.message}", soft_wrap=True)
+    if not found.converged:
+        errors.print("[yellow]Caution[/]: a stage stopped before its tolerance; see report.json.")
+
+
+def _error_table(error: Evaluation) -> Table:
+    table = Table(box=None, show_header=False)
+    table.add_row("e3D", f"[bold]{error.e3d:.4f}[/]", f"in the {error.frame} frame")
+    table.add_row("", f"{error.e3d_per_frame:.4f}", "each frame aligned on its own")
+    table.add_row("", f"{error.relative_rms:.4f}", "relative RMS")
+    return table

@@ -1,0 +1,135 @@
+"""Commands that serve: the API with its workers and its Redis, or one worker of a cluster.
+
+What only a server needs is imported when it starts: the other commands need not wait for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.exits import ExitCode, complain, console
+from worker.logs import configure_logging
+from worker.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from types import FrameType
+
+_BACKLOG = 2048
+
+
+def serve(
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; 0.0.0.0 is every address.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one.")
+    ] = 8000,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, help="Worker processes; 0 leaves the work to workers elsewhere."),
+    ] = None,
+    data_dir: Annotated[
+        Path | None,
+        typer.Option(file_okay=False, help="Folder of uploads, results and the embedded Redis."),
+    ] = None,
+) -> None:
+    """Serve the API and run its workers until interrupted.
+
+    Without REDIS_URL an embedded Redis server keeps the queue in the data folder. Everything else
+    is set by SMSR_* variables.
+    """
+    from service.server import run_server
+    from worker.pool import WorkerPool
+    from worker.redis_server import DataFolderInUse, EmbeddedRedis, ServerFailed
+
+    settings = _settings(workers=workers or None, data_dir=data_dir)
+    configure_logging(settings.log_level)
+    with _until_signalled(), contextlib.ExitStack() as stack:
+        listener = stack.enter_context(contextlib.closing(_listen(host, port)))
+        if settings.redis_url is None:
+            try:
+                redis = stack.enter_context(EmbeddedRedis(settings.data_dir / "redis"))
+            except (DataFolderInUse, ServerFailed) as error:
+                complain(str(error))
+                raise typer.Exit(ExitCode.FAILED) from error
+            settings = settings.model_copy(update={"redis_url": redis.url})
+        if workers != 0:
+            stack.enter_context(WorkerPool(settings))
+        url = _url(host, listener)
+        if not run_server(
+            settings, listener, lambda: console.print(f"SMSR serves {url}", soft_wrap=True)
+        ):
+            raise typer.Exit(ExitCode.FAILED)
+
+
+def worker() -> None:
+    """Run one worker process of a cluster; REDIS_URL says where the queue is."""
+    settings = _settings()
+    if settings.redis_url is None:
+        complain("Set REDIS_URL to the Redis server of the queue, or use smsr serve.")
+        raise typer.Exit(ExitCode.USAGE)
+
+    # A program of its own: a worker sets its number of BLAS threads before NumPy is loaded, and
+    # forks for each job, which a process that has started threads should not.
+    os.execv(sys.executable, [sys.executable, "-m", "worker.main"])
+
+
+def _settings(**given: object) -> Settings:
+    """Return the settings of the environment, with those given on the command line."""
+    return Settings.model_validate(
+        Settings().model_dump() | {name: v for name, v in given.items() if v is not None}
+    )
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Bind before anything else starts, so that a taken port costs nothing."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        listener = socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    except OSError as error:
+        raise OSError(
+            error.errno, f"Cannot listen on {host} port {port}: {error.strerror}. Try --port."
+        ) from error
+    listener.set_inheritable(False)
+    return listener
+
+
+def _url(host: str, listener: socket.socket) -> str:
+    """Return an address that a client on this machine can use."""
+    if host in ("", "0.0.0.0", "::"):  # noqa: S104
+        host = "127.0.0.1"
+    elif ":" in host:
+        host = f"[{host}]"
+    return f"http://{host}:{listener.getsockname()[1]}"
+
+
+@contextlib.contextmanager
+def _until_signalled() -> Iterator[None]:
+    """End the body in order at the first SIGINT or SIGTERM; later ones change nothing.
+
+    Uvicorn handles both itself while it serves and sends itself the signal again when it is done,
+    which would end the process before workers and Redis are stopped.
+    """
+    stopping = threading.Event()
+
+    def stop(_signum: int, _frame: FrameType | None) -> None:
+        if not stopping.is_set():
+            stopping.set()
+            raise SystemExit(ExitCode.OK)
+
+    former = {s: signal.signal(s, stop) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for signum, handler in former.items():
+            signal.signal(signum, handler)

@@ -1,0 +1,337 @@
+"""The command as a person meets it: real processes, their output and their exit status."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from smsr.synthetic import write_example
+from tests.conftest import clean_environment, serving
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.conftest import Served
+
+pytestmark = pytest.mark.slow
+
+
+def smsr(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "service.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env=clean_environment(),
+        timeout=240,
+        check=False,
+    )
+
+
+def succeeded(result: subprocess.CompletedProcess[str]) -> str:
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("example")
+    succeeded(smsr("example", folder, "--frames", "24", "--side", "7"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(example: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("result") / "out"
+    succeeded(
+        smsr(
+            *("reconstruct", example / "measurements.npy", "-o", out),
+            *("--ground-truth", example / "ground_truth.npy"),
+            *("--faces", example / "faces.npy"),
+        )
+    )
+    return out
+
+
+def test_reconstruct_writes_arrays_frames_and_a_report(result: Path, example: Path) -> None:
+    with np.load(result / "result.npz") as arrays:
+        shapes, cameras, translations = (
+            arrays[name] for name in ("shapes", "cameras", "translations")
+        )
+        assert np.array_equal(arrays["faces"], np.load(example / "faces.npy"))
+    assert shapes.shape == (24, 49, 3)
+    W = np.load(example / "measurements.npy").reshape(24, 2, 49)
+    projected = cameras @ shapes.transpose(0, 2, 1) + translations[:, :, None]
+    assert np.abs(projected - W).max() < 1e-3 * np.abs(W).max()
+    assert len(list((result / "frames").glob("frame_*.ply"))) == 24
+    report = json.loads((result / "report.json").read_text())
+    assert report["frames"] == 24
+    assert report["metrics"]["e3d"] < 1
+    assert {path.name for path in result.iterdir()} == {"result.npz", "report.json", "frames"}
+
+
+def test_the_frames_are_meshes_others_can_read(result: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    mesh = trimesh.load(result / "frames" / "frame_0007.ply", process=False)
+    with np.load(result / "result.npz") as arrays:
+        assert np.allclose(mesh.vertices, arrays["shapes"][7])
+        assert np.array_equal(mesh.faces, arrays["faces"])
+
+
+def test_evaluate_agrees_with_the_report(result: Path, example: Path) -> None:
+    out = succeeded(smsr("evaluate", example / "ground_truth.npy", result / "result.npz", "--json"))
+    report = json.loads((result / "report.json").read_text())
+    assert json.loads(out)["e3d"] == pytest.approx(report["metrics"]["e3d"], rel=1e-5)
+
+
+def test_evaluate_shows_the_error(result: Path, example: Path) -> None:
+    out = succeeded(smsr("evaluate", example / "ground_truth.npy", result / "result.npz"))
+    assert "e3D" in out
+
+
+def test_reconstruct_prints_json_and_nothing_else(example: Path, tmp_path: Path) -> None:
+    run = smsr("reconstruct", example / "measurements.npy", "--json", "--no-ply", cwd=tmp_path)
+    report = json.loads(succeeded(run))
+    assert report["points"] == 49
+    assert report["metrics"] is None
+    assert {path.name for path in (tmp_path / "measurements-3d").iterdir()} == {
+        "result.npz",
+        "report.json",
+    }
+
+
+def test_options_reach_the_solver(example: Path, tmp_path: Path) -> None:
+    run = smsr(
+        *("reconstruct", example / "measurements.npy", "-o", tmp_path, "--no-ply", "--json"),
+        *("--preset", "paper", "-O", "layout=interleaved"),
+    )
+    assert (
+        json.loads(succeeded(run))["options"] | {"preset": "paper"}
+        == (json.loads(run.stdout)["options"])
+    )
+    assert json.loads(run.stdout)["options"]["layout"] == "interleaved"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (["reconstruct", "nothing.npy"], 2, "does not exist"),
+        (["reconstruct", "odd.npy"], 3, "odd"),
+        (["reconstruct", "text.npy"], 3, "text.npy"),
+        (["reconstruct", "good.npy", "-O", "perset=paper"], 2, "Did you mean 'preset'"),
+        (["reconstruct", "good.npy", "-O", "layout=sideways"], 2, "interleaved"),
+        (["reconstruct", "good.npy", "-O", "layout"], 2, "name=value"),
+        (["reconstruct", "good.npy", "--ground-truth", "other.npy"], 3, "ground truth"),
+        (["evaluate", "other.npy", "good.npy"], 3, "shapes"),
+        (["submit", "good.npy", "--server", "http://127.0.0.1:9", "--patience", "0"], 4, "server"),
+        (["submit", "good.npy", "--server", "no address", "--patience", "0"], 4, "no address"),
+        (["jobs", "list", "--server", "http://127.0.0.1:9", "--patience", "0"], 4, "127.0.0.1:9"),
+        (["worker"], 2, "REDIS_URL"),
+        (["benchmark", "--data", ".", "--sets", "drunk"], 3, "drink"),
+        (["reconsruct"], 2, "reconsruct"),
+    ],
+)
+def test_mistakes_are_told_in_a_line_and_an_exit_status(
+    tmp_path: Path, arguments: list[str], code: int, says: str
+) -> None:
+    generator = np.random.default_rng(0)
+    np.save(tmp_path / "odd.npy", generator.standard_normal((7, 10)))
+    np.save(tmp_path / "good.npy", generator.standard_normal((8, 10)))
+    np.save(tmp_path / "other.npy", generator.standard_normal((15, 10)))
+    (tmp_path / "text.npy").write_text("this is no array")
+    run = smsr(*arguments, cwd=tmp_path)
+    assert run.returncode == code, run.stderr
+    assert says in " ".join((run.stdout + run.stderr).replace("│", " ").split())
+    assert "Traceback" not in run.stderr
+
+
+def test_an_interrupt_ends_a_run_without_a_trace(tmp_path: Path) -> None:
+    write_example(tmp_path, frames=60, side=60)
+    with subprocess.Popen(
+        [sys.executable, "-m", "service.cli", "reconstruct", "measurements.npy"],
+        cwd=tmp_path,
+        env=clean_environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        folder = tmp_path / "measurements-3d"
+        until(lambda: folder.exists() and any(folder.iterdir()))
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert not any(path.name.startswith(".arrays") for path in folder.iterdir())
+
+
+def test_options_are_listed_in_every_form() -> None:
+    listed = json.loads(succeeded(smsr("options", "--json")))
+    by_name = {option["name"]: option for option in listed}
+    assert by_name["preset"]["choices"] == ["default", "paper"]
+    for form in ([], ["--markdown"]):
+        shown = succeeded(smsr("options", *form))
+        assert all(name in shown for name in by_name)
+
+
+def test_version_and_help() -> None:
+    assert succeeded(smsr("--version")).startswith("smsr ")
+    assert "Exit status" in succeeded(smsr("--help"))
+
+
+def test_submit_many_files_of_which_one_is_bad(
+    served: Served, example: Path, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "odd.npy", np.ones((7, 10)))
+    good = example / "measurements.npy"
+    copy = tmp_path / "second.npy"
+    copy.write_bytes(good.read_bytes())
+    run = smsr(
+        *("submit", good, tmp_path / "odd.npy", copy, "--server", served.url),
+        *("--ground-truth", example / "ground_truth.npy", "-o", tmp_path / "out"),
+        *("-O", "layout=interleaved"),
+    )
+    assert run.returncode == 3, run.stderr
+    assert "odd.npy: " in run.stderr
+    assert run.stdout.count("succeeded") == 2
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["measurements", "second"]
+    for name in ("measurements", "second"):
+        folder = tmp_path / "out" / name
+        assert len(list((folder / "frames").glob("*.ply"))) == 24
+        with np.load(folder / "result.npz") as arrays:
+            assert arrays["shapes"].shape == (24, 49, 3)
+        assert (folder / "report.json").is_file()
+
+
+def test_a_job_that_fails_is_told_with_its_reason(served: Served, tmp_path: Path) -> None:
+    np.save(tmp_path / "constant.npy", np.zeros((20, 30)))
+    run = smsr("submit", tmp_path / "constant.npy", "--wait", "--server", served.url)
+    assert run.returncode == 1
+    assert "do not vary" in run.stderr
+
+
+def test_jobs_are_looked_after(served: Served, example: Path, tmp_path: Path) -> None:
+    url = ("--server", served.url)
+    submitted = smsr("submit", example / "measurements.npy", "--json", *url)
+    (job,) = json.loads(succeeded(submitted))
+    out = tmp_path / "out"
+    succeeded(smsr("jobs", "download", job["id"], "-o", out, "--no-ply", *url))
+    assert {path.name for path in out.iterdir()} == {"result.npz", "report.json"}
+    shown: dict[str, Any] = json.loads(succeeded(smsr("jobs", "show", job["id"], *url)))
+    assert shown["status"] == "succeeded"
+    listed = succeeded(smsr("jobs", "list", "--status", "succeeded", *url))
+    assert job["id"] in listed
+    refused = smsr("jobs", "cancel", job["id"], *url)
+    assert refused.returncode == 1
+    assert "finished" in refused.stderr
+    succeeded(smsr("jobs", "delete", job["id"], *url))
+    assert smsr("jobs", "show", job["id"], *url).returncode == 1
+
+
+def test_serve_restarts_workers_and_leaves_nothing_behind(tmp_path: Path, example: Path) -> None:
+    with serving(tmp_path, "--workers", "2", environment=clean_environment()) as server:
+        until(lambda: len(workers_of(server)) == 2)
+        first, _ = workers_of(server)
+        os.kill(first, signal.SIGKILL)
+        until(lambda: len(workers_of(server)) == 2 and first not in workers_of(server))
+        succeeded(smsr("submit", example / "measurements.npy", "--wait", "--server", server.url))
+        family = descendants(server.process.pid)
+        assert len(family) >= 3, "Redis and two workers"
+    assert server.process.returncode == 0, server.log.read_text()
+    until(lambda: not [pid for pid in family if alive(pid)])
+
+
+def test_serve_goes_on_where_it_was(tmp_path: Path, example: Path) -> None:
+    with serving(tmp_path, environment=clean_environment()) as server:
+        run = smsr(
+            "submit", example / "measurements.npy", "--wait", "--json", "--server", server.url
+        )
+        (job,) = json.loads(succeeded(run))
+    with serving(tmp_path, environment=clean_environment()) as server:
+        shown = smsr("jobs", "show", job["id"], "--server", server.url)
+        assert json.loads(succeeded(shown))["status"] == "succeeded"
+
+
+def test_serve_killed_outright_takes_its_processes_along(tmp_path: Path) -> None:
+    with serving(tmp_path, environment=clean_environment()) as server:
+        until(lambda: len(workers_of(server)) == 1)
+        family = descendants(server.process.pid)
+        server.process.kill()
+        server.process.wait(10)
+        until(lambda: not [pid for pid in family if alive(pid)])
+
+
+def test_serve_says_that_a_port_is_taken(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        run = smsr("serve", "--port", str(port), "--data-dir", tmp_path / "data")
+    assert run.returncode == 1
+    assert f"port {port}" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+@pytest.mark.data
+def test_benchmark_measures_a_set_in_its_own_process() -> None:
+    data = Path(os.environ.get("SMSR_DATA", Path(__file__).parents[3] / "shared" / "data"))
+    if not (data / "sparse" / "yoga.mat").is_file():
+        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+    run = smsr("benchmark", "--data", data, "--sets", "yoga,dinosaur", "--json")
+    report = json.loads(succeeded(run))
+    yoga, dinosaur = report["sets"]
+    assert (yoga["frames"], yoga["points"]) == (307, 41)
+    assert list(yoga["e3d"]) == ["object"]
+    assert list(dinosaur["e3d"]) == ["object", "camera"]
+    assert yoga["start_bytes"] < yoga["peak_bytes"] < 2 << 30
+    assert report["environment"]["blas_threads"] == 1
+
+
+def until(condition: Any, seconds: float = 30.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def processes() -> Iterator[tuple[int, int, str, list[str]]]:
+    """Process id, parent, state and command of every process, from /proc."""
+    for folder in Path("/proc").iterdir():
+        if not folder.name.isdigit():
+            continue
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            command = (folder / "cmdline").read_text().split("\0")
+        except OSError:
+            continue
+        yield int(folder.name), int(fields[1]), fields[0], command
+
+
+def descendants(root: int) -> set[int]:
+    parents = {pid: parent for pid, parent, _, _ in processes()}
+    found: set[int] = set()
+    new = {root}
+    while new:
+        new = {pid for pid, parent in parents.items() if parent in new}
+        found |= new
+    return found
+
+
+def workers_of(server: Served) -> list[int]:
+    """Return the worker processes that the server itself started."""
+    return [
+        pid
+        for pid, parent, _, command in processes()
+        if parent == server.process.pid and "worker.main" in command
+    ]
+
+
+def alive(pid: int) -> bool:
+    return any(pid == other and state != "Z" for other, _, state, _ in processes())
