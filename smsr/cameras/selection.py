@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from smsr.options import Options
     from smsr.progress import StageHook
 
-UNEXPLAINED_LIMIT = 0.15
+UNEXPLAINED_LIMIT = 0.10
 """Part of the rotation variance of the free cameras that a uniform turn may leave unexplained."""
 
-ENERGY_LIMIT = 0.25
+ENERGY_LIMIT = 0.12
 """Most that the logarithmic energy may rise from the free cameras to a uniform turn."""
+
+_ENERGY_DIRECTIONS = 32
+_ENERGY_REST = 0.005  # part of the measurements that energies may leave out
 
 
 def estimate_cameras(
@@ -83,8 +86,8 @@ def with_uniform_turn(
     ----------
     free : CameraEstimate
         Cameras without a motion model.
-    measurements : ndarray of shape (2T, N)
-        W, centred, rows u1, v1, u2, ...
+    measurements : ndarray of shape (2T, q)
+        Virtual points: left singular vectors times singular values, largest first.
     hook : callable
         See `smsr.progress.StageHook`.
     force : bool
@@ -97,14 +100,15 @@ def with_uniform_turn(
     if unexplained > UNEXPLAINED_LIMIT and not force:
         reason = f"a uniform turn leaves {unexplained:.0%} of the rotation unexplained"
         return dataclasses.replace(free, reason=f"{free.reason}; {reason}")
-    before = measure_energy(measurements, free.rotations)
-    after = measure_energy(measurements, turn)
+    leading = _leading_directions(measurements)
+    before = measure_energy(leading, free.rotations)
+    after = measure_energy(leading, turn)
     rise = after.log_energy - before.log_energy
     if rise > ENERGY_LIMIT and not force:
         reason = f"a uniform turn raises the log energy by {rise:.2f}"
         return dataclasses.replace(free, reason=f"{free.reason}; {reason}")
     velocity = refine_uniform_turn(
-        measurements, velocity, middle, motion_weight=after.motion_weight, hook=hook
+        leading, velocity, middle, motion_weight=after.motion_weight, hook=hook
     )
     degrees = math.degrees(float(np.linalg.norm(velocity)))
     return dataclasses.replace(
@@ -114,6 +118,14 @@ def with_uniform_turn(
         reason=f"{free.reason}; a uniform turn of {degrees:.2f} degrees a frame leaves "
         f"{unexplained:.1%} of the rotation unexplained",
     )
+
+
+def _leading_directions(measurements: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the virtual points (2T, k) that energies are measured on."""
+    squares = (measurements**2).sum(axis=0)
+    rest = np.sqrt(np.cumsum(squares[::-1])[::-1] / squares.sum())
+    count = int((rest > _ENERGY_REST).sum())
+    return measurements[:, : min(max(count, 4), _ENERGY_DIRECTIONS)]
 
 
 def unexplained_rotation(rotations: NDArray[np.float64], model: NDArray[np.float64]) -> float:
