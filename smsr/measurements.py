@@ -42,7 +42,7 @@ CHUNK_BYTES = 16 * 2**20
 """Default size of a chunk: long enough runs of each row for a disk, small beside any memory."""
 
 _CHECKED_AT_ONCE = 8 * 2**20
-_RELEASE_BYTES = 128 * 2**20
+_RELEASE_BYTES = 64 * 2**20
 
 
 @runtime_checkable

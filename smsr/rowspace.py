@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from smsr.progress import StageHook
 
 _EPS = float(np.finfo(np.float64).eps)
+_LARGEST = 1e150  # so that squares stay finite
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +146,7 @@ def _factor_chunk(source: MeasurementSource, chunk_bytes: int) -> int:
 
 def _row_space(total: Triangle, shift: NDArray[np.float64], source: MeasurementSource) -> RowSpace:
     """Turn the triangle of all points into the factor, by its singular value decomposition."""
-    if not np.isfinite(total.rows).all():
+    if not np.abs(total.rows).max() < _LARGEST:
         raise _too_large()
     with few_blas_threads(total.rows):
         _, values, right = np.linalg.svd(total.rows, full_matrices=False)
@@ -224,12 +225,9 @@ def map_back(
     """
     points = source.points
     sink = sink_for(out, source.frames, points, _result_dtype(source.dtype))
-    operator = _operator(A, rowspace, sink.dtype)
     size = min(points, chunk_points(source, chunk_bytes))
     workers = min(workers or blas_threads(), -(-points // size))
     spaces: SimpleQueue[Workspace] = SimpleQueue()
-    for _ in range(workers):
-        spaces.put(Workspace(operator, size, sink.dtype))
 
     def work(points: slice, block: NDArray[Any]) -> None:
         space = spaces.get()
@@ -243,6 +241,9 @@ def map_back(
             spaces.put(space)
 
     try:
+        operator = _operator(A, rowspace, sink.dtype)
+        for _ in range(workers):
+            spaces.put(Workspace(operator, size, sink.dtype))
         done = map_chunks(work, checked_chunks(source, size), workers)
         for index, (stop, _) in enumerate(done, 1):
             progress(stop / points, index, None)
