@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import smsr
 from service.cli import benchmark, demo, local, remote, serve
 from service.cli.exits import EXPECTED, HELP, console, leave
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -47,9 +50,15 @@ def top(
     """Reconstruct moving 3D surfaces from 2D point tracks of one camera."""
 
 
-def main() -> None:
-    """Run the command line; expected errors end it with one line and an exit code."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line; expected errors end it with one line and an exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the process by default.
+    """
     try:
-        app(prog_name="smsr")
+        app(arguments, prog_name="smsr")
     except EXPECTED as error:
         leave(error)

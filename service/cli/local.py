@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import tempfile
 from pathlib import Path
@@ -15,6 +16,7 @@ import smsr
 from service.cli import option_values
 from service.cli.bars import SolverBar, progress_bars
 from service.cli.exits import console, errors
+from smsr.errors import InputError
 from smsr.files import load_faces, open_array, write_npz, write_ply
 from smsr.measurements import as_source
 from smsr.metrics import Frame, as_shapes
@@ -24,6 +26,8 @@ from smsr.synthetic import write_example
 from worker.options import JobOptions
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from smsr.metrics import Evaluation
@@ -77,13 +81,16 @@ def reconstruct(
     """
     options = parse(Options, preset_and_options(Options, preset, option))
     # All inputs are checked before the work begins.
-    source = as_source(open_array(file, key=key), options.layout)
+    with _naming(file):
+        source = as_source(open_array(file, key=key), options.layout)
     truth = triangles = None
     if ground_truth is not None:
-        truth = open_array(ground_truth, key=ground_truth_key, role="ground_truth")
-        truth = as_shapes(truth, source.frames, source.points)
+        with _naming(ground_truth):
+            truth = open_array(ground_truth, key=ground_truth_key, role="ground_truth")
+            truth = as_shapes(truth, source.frames, source.points)
     if faces is not None:
-        triangles = load_faces(faces, source.points, key=faces_key)
+        with _naming(faces):
+            triangles = load_faces(faces, source.points, key=faces_key)
     target = out or Path(f"{file.stem}-3d")
     target.mkdir(parents=True, exist_ok=True)
 
@@ -118,8 +125,11 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Measure the error of a result against ground truth."""
-    truth = open_array(ground_truth, key=key, role="ground_truth")
-    error = smsr.evaluate(truth, _read_result(result), frame=frame)
+    with _naming(ground_truth):
+        truth = open_array(ground_truth, key=key, role="ground_truth")
+    with _naming(result):
+        found = _read_result(result)
+    error = smsr.evaluate(truth, found, frame=frame)
     if as_json:
         console.print_json(data=error.to_dict())
     else:
@@ -184,6 +194,15 @@ def _cells(what: OptionDescription) -> tuple[str, str, str, str, str]:
         span = "" if high is None else f"at most {high:g}"
     default = "none" if what.default is None else default
     return what.name, what.type, default, span, what.help
+
+
+@contextlib.contextmanager
+def _naming(file: Path) -> Iterator[None]:
+    """Begin the message of what is wrong with a file with its name."""
+    try:
+        yield
+    except InputError as error:
+        raise type(error)(f"{file}: {error.detail}", **error.context) from error
 
 
 def _write(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from service.cli import main
 from smsr.synthetic import write_example
 from tests.conftest import clean_environment, serving
 
@@ -126,7 +127,7 @@ def test_options_reach_the_solver(example: Path, tmp_path: Path) -> None:
     ("arguments", "code", "says"),
     [
         (["reconstruct", "nothing.npy"], 2, "does not exist"),
-        (["reconstruct", "odd.npy"], 3, "odd"),
+        (["reconstruct", "odd.npy"], 3, "7 rows"),
         (["reconstruct", "text.npy"], 3, "text.npy"),
         (["reconstruct", "good.npy", "-O", "perset=paper"], 2, "Did you mean 'preset'"),
         (["reconstruct", "good.npy", "-O", "layout=sideways"], 2, "interleaved"),
@@ -142,16 +143,31 @@ def test_options_reach_the_solver(example: Path, tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_are_told_in_a_line_and_an_exit_status(
-    tmp_path: Path, arguments: list[str], code: int, says: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    says: str,
 ) -> None:
     generator = np.random.default_rng(0)
     np.save(tmp_path / "odd.npy", generator.standard_normal((7, 10)))
     np.save(tmp_path / "good.npy", generator.standard_normal((8, 10)))
     np.save(tmp_path / "other.npy", generator.standard_normal((15, 10)))
     (tmp_path / "text.npy").write_text("this is no array")
-    run = smsr(*arguments, cwd=tmp_path)
-    assert run.returncode == code, run.stderr
-    assert says in " ".join((run.stdout + run.stderr).replace("│", " ").split())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "environ", clean_environment())
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == code
+    assert says in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
+def test_the_process_ends_with_the_exit_status(tmp_path: Path) -> None:
+    (tmp_path / "text.npy").write_text("this is no array")
+    run = smsr("reconstruct", "text.npy", cwd=tmp_path)
+    assert run.returncode == 3
+    assert run.stdout == ""
     assert "Traceback" not in run.stderr
 
 
