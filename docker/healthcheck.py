@@ -33,7 +33,7 @@ def worker_is_alive(silence: float = 15.0) -> bool:
 def healthy() -> bool:
     """Look after what this container was started for."""
     command = Path("/proc/1/cmdline").read_text().split("\0")
-    if "worker" in command:
+    if "serve" not in command:
         return worker_is_alive()
     return api_is_ready(command[command.index("--port") + 1] if "--port" in command else "8000")
 

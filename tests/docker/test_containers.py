@@ -301,10 +301,10 @@ def test_a_container_that_dies_comes_back_by_itself(cluster: Compose) -> None:
 
 
 def test_a_job_over_the_memory_limit_fails_clearly(cluster: Compose, sender: Sender) -> None:
-    """Some memory grows with the square of the frames: these tracks are small, the job is not."""
+    """Frames and points both in thousands, and tracks that have no structure: the hardest case."""
     before = {name: inspect(name)["State"]["StartedAt"] for name in cluster.containers("worker")}
     rng = np.random.default_rng(0)
-    large = sender.send(rng.standard_normal((2 * 6000, 40)))
+    large = sender.send(rng.standard_normal((4000, 4000), dtype=np.float32))
     ended = sender.client.wait(large.id, timeout=300)
     assert ended.status == "failed"
     assert ended.problem is not None
