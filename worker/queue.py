@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, cast
 
 import structlog
 from rq import Queue
-from rq.exceptions import NoSuchJobError
+from rq.exceptions import InvalidJobOperation, NoSuchJobError
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
@@ -210,8 +210,8 @@ class JobQueue:
         self.redis.lrem(self.rq.intermediate_queue_key, 0, ticket)
         try:
             Job.fetch(ticket, connection=self.redis, serializer=JSONSerializer).delete()
-        except (NoSuchJobError, ValueError):
-            # ValueError: the execution's own hash has expired before its entry in the registry.
+        except (NoSuchJobError, InvalidJobOperation, ValueError):
+            # InvalidJobOperation: its worker has just finished and removed it. ValueError: the execution's own hash has expired before its entry in the registry.
             self.redis.delete(Job.key_for(ticket))
 
     # Keeping order
