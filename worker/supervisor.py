@@ -93,8 +93,9 @@ class Supervisor(Worker):
         self.beat = beat
         self.stop_at: float | None = None
         self._watch = _Watch()
-        # A former instance of this process may not have been able to say goodbye.
-        connection.delete(self.redis_worker_namespace_prefix + name)
+        # A former instance of this process may not have been able to say goodbye. RQ's own client
+        # is not to connect before RQ has given it the patience for its long waits.
+        queue.redis.delete(self.redis_worker_namespace_prefix + name)
         super().__init__(
             [queue.settings.queue],
             name=name,
