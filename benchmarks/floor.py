@@ -5,14 +5,14 @@
 The floor reads W once, multiplies two matrices with the operation counts of the factorisation
 (float64) and of the map back (float32), and writes S sequentially, each with plain numpy and plain
 files. Floor and passes alternate in one run, so that both meet the same machine; the table gives
-medians, and the ratio is the median of the ratios of neighbours.
+medians of wall time, and each ratio is the median over the runs: of wall time, and of processor
+time for machines that are busy with other things.
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
-import statistics
 import tempfile
 import time
 from pathlib import Path
@@ -42,10 +42,11 @@ def make_measurements(path: Path, frames: int, points: int) -> None:
     W.flush()
 
 
-def timed(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
+def timed(work: Callable[[], object]) -> tuple[float, float]:
+    """Return the wall and the processor time."""
+    wall, processor = time.perf_counter(), time.process_time()
     work()
-    return time.perf_counter() - start
+    return time.perf_counter() - wall, time.process_time() - processor
 
 
 def read_floor(path: Path) -> None:
@@ -91,20 +92,14 @@ def measure(frames: int, points: int, repeats: int, folder: Path) -> None:
         "factorise": lambda: factorise(source),
         "map back": lambda: map_back(source, rowspace, A, folder / "S"),
     }
-    seconds: dict[str, list[float]] = {name: [] for name in parts}
-    for _ in range(repeats):
-        for name, work in parts.items():
-            seconds[name].append(timed(work))
-    runs = list(zip(*seconds.values(), strict=True))
-    ratios = [sum(run[4:]) / sum(run[:4]) for run in runs]
-    cells = [f"{statistics.median(values):9.3f}" for values in seconds.values()]
-    floor = statistics.median(sum(run[:4]) for run in runs)
-    ours = statistics.median(sum(run[4:]) for run in runs)
+    runs = np.array([[timed(work) for work in parts.values()] for _ in range(repeats)])
+    floor, ours = runs[:, :4].sum(axis=1), runs[:, 4:].sum(axis=1)
+    walls = np.median(np.column_stack([runs[:, :, 0], floor[:, 0], ours[:, 0]]), axis=0)
+    ratios = np.median(ours / floor, axis=0)
     print(
         f"{points:9d}",
-        *cells,
-        f"{floor:9.3f}{ours:9.3f}{statistics.median(ratios):7.2f}",
-        flush=True,
+        *(f"{value:9.3f}" for value in walls),
+        *(f"{value:9.2f}" for value in ratios),
     )
 
 
@@ -115,11 +110,10 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--folder", type=Path, help="where files go; the default is temporary")
     arguments = parser.parse_args()
-    names = ("read", "matmul 1", "matmul 2", "write", "factorise", "map back")
+    columns = ["points", "read", "matmul 1", "matmul 2", "write", "factorise", "map back"]
+    columns += ["floor", "ours", "ratio", "cpu ratio"]
     print(f"{arguments.frames} frames, {blas_threads()} threads, seconds (median)")
-    print(
-        f"{'points':>9}", *(f"{name:>9}" for name in names), f"{'floor':>9}{'ours':>9}{'ratio':>7}"
-    )
+    print(*(f"{column:>9}" for column in columns))
     for points in arguments.points:
         with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
             measure(arguments.frames, points, arguments.repeats, Path(folder))
