@@ -89,7 +89,7 @@ class Options:
         "in the preset 'paper' for up to 1000 points, as published, and off otherwise.",
     )
     smoothing_ratio: float = option(
-        0.1,
+        0.3,
         "Number of cosines in the smoothing stage, as a part of the number of frames.",
         minimum=0.001,
         maximum=1.0,

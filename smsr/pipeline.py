@@ -193,7 +193,7 @@ def _smooth(
 ) -> SmoothMotion | None:
     """Fit a smooth motion where that is asked for and can leave anything out."""
     frames = len(rotations)
-    basis_size = min(basis_size, (min(2 * frames, virtual.shape[1]) - 1) // 3)
+    basis_size = min(basis_size, (2 * frames - 1) // 3)
     if not options.smoothing or basis_size < 1:
         return None
     return smooth_trajectories(

@@ -25,9 +25,14 @@ if TYPE_CHECKING:
 UNEXPLAINED_LIMIT = 0.10
 """Part of the rotation variance of the free cameras that a uniform turn may leave unexplained."""
 
-ENERGY_LIMIT = 0.12
+ENERGY_LIMIT = 0.25
 """Most that the logarithmic energy may rise from the free cameras to a uniform turn."""
 
+SPAN_LIMIT = 0.06
+"""Most of a uniform turn that may lie outside the leading left singular vectors of W, unless more
+of the free cameras does."""
+
+_SPAN_DIRECTIONS = 18
 _ENERGY_DIRECTIONS = 32
 _ENERGY_REST = 0.005  # part of the measurements that energies may leave out
 
@@ -70,12 +75,13 @@ def estimate_cameras(
     if options.camera_model == "relaxed":
         return free
     forced = options.camera_model == "uniform"
-    return with_uniform_turn(free, left * values, part_of(hook, 0.5, 1.0), force=forced)
+    return with_uniform_turn(free, left, values, part_of(hook, 0.5, 1.0), force=forced)
 
 
 def with_uniform_turn(
     free: CameraEstimate,
-    measurements: NDArray[np.float64],
+    left: NDArray[np.float64],
+    values: NDArray[np.float64],
     hook: StageHook = ignore,
     *,
     force: bool = False,
@@ -86,8 +92,8 @@ def with_uniform_turn(
     ----------
     free : CameraEstimate
         Cameras without a motion model.
-    measurements : ndarray of shape (2T, q)
-        Virtual points: left singular vectors times singular values, largest first.
+    left, values
+        As for `estimate_cameras`.
     hook : callable
         See `smsr.progress.StageHook`.
     force : bool
@@ -98,34 +104,64 @@ def with_uniform_turn(
     turn = turning_cameras(velocity, middle, frames)
     unexplained = unexplained_rotation(free.rotations, turn)
     if unexplained > UNEXPLAINED_LIMIT and not force:
-        reason = f"a uniform turn leaves {unexplained:.0%} of the rotation unexplained"
-        return dataclasses.replace(free, reason=f"{free.reason}; {reason}")
-    leading = _leading_directions(measurements)
+        return _refused(free, f"leaves {unexplained:.0%} of the rotation unexplained")
+    leading = (left * values)[:, : _leading_directions(values)]
     before = measure_energy(leading, free.rotations)
     after = measure_energy(leading, turn)
     rise = after.log_energy - before.log_energy
     if rise > ENERGY_LIMIT and not force:
-        reason = f"a uniform turn raises the log energy by {rise:.2f}"
-        return dataclasses.replace(free, reason=f"{free.reason}; {reason}")
+        return _refused(free, f"raises the log energy of the shapes by {rise:.2f}")
     velocity = refine_uniform_turn(
         leading, velocity, middle, motion_weight=after.motion_weight, hook=hook
     )
+    turn = turning_cameras(velocity, middle, frames)
+    outside = part_outside_span(left, turn)
+    if outside > max(SPAN_LIMIT, part_outside_span(left, free.rotations)) and not force:
+        return _refused(free, f"lies outside the span of the measurements by {outside:.1%}")
     degrees = math.degrees(float(np.linalg.norm(velocity)))
     return dataclasses.replace(
         free,
-        rotations=turning_cameras(velocity, middle, frames),
+        rotations=turn,
         model="uniform",
         reason=f"{free.reason}; a uniform turn of {degrees:.2f} degrees a frame leaves "
         f"{unexplained:.1%} of the rotation unexplained",
     )
 
 
-def _leading_directions(measurements: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the virtual points (2T, k) that energies are measured on."""
-    squares = (measurements**2).sum(axis=0)
+def _refused(free: CameraEstimate, why: str) -> CameraEstimate:
+    """Return the free cameras with the reason why they were kept."""
+    return dataclasses.replace(free, reason=f"{free.reason}; a uniform turn {why}")
+
+
+def part_outside_span(left: NDArray[np.float64], rotations: NDArray[np.float64]) -> float:
+    """Return how much of the cameras no combination of the leading directions of W explains.
+
+    Where the deformation is a sum of basis shapes, W = R (C kron I_3) B, and the mean shape is one
+    of them, the columns of R themselves lie in the column space of W. Wrong cameras do not.
+
+    Parameters
+    ----------
+    left : ndarray of shape (2T, r)
+        Left singular vectors of the centred measurements, strongest first.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+
+    Returns
+    -------
+    float
+        ``||R - U U^T R|| / ||R||``, U the leading columns.
+    """
+    R = rotations[:, :2].reshape(len(left), 3)
+    # At most half of the dimensions: in more than that anything lies nearly.
+    U = left[:, : min(_SPAN_DIRECTIONS, len(rotations))]
+    return float(np.linalg.norm(R - U @ (U.T @ R)) / np.linalg.norm(R))
+
+
+def _leading_directions(values: NDArray[np.float64]) -> int:
+    """Return on how many virtual points energies are measured."""
+    squares = values**2
     rest = np.sqrt(np.cumsum(squares[::-1])[::-1] / squares.sum())
-    count = int((rest > _ENERGY_REST).sum())
-    return measurements[:, : min(max(count, 4), _ENERGY_DIRECTIONS)]
+    return min(max(int((rest > _ENERGY_REST).sum()), 4), _ENERGY_DIRECTIONS)
 
 
 def unexplained_rotation(rotations: NDArray[np.float64], model: NDArray[np.float64]) -> float:
