@@ -11,6 +11,7 @@ import re
 import socket
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import httpx
@@ -23,7 +24,6 @@ from tests.docker.engine import REPOSITORY, Compose, docker, inspect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -332,6 +332,41 @@ def test_nothing_is_left_after_down(cluster: Compose) -> None:
     assert all(cluster.leftovers().values())
     cluster("down", "--volumes")
     assert cluster.leftovers() == {"containers": [], "volumes": [], "networks": []}
+
+
+def test_objects_can_be_in_an_s3_store(image: str, tmp_path: Path) -> None:
+    """The second Compose file, with another S3 server in the place of its own."""
+    folder = REPOSITORY / "docker"
+    compose = Compose(
+        "smsr-test-s3",
+        {
+            "SMSR_IMAGE": image,
+            "SMSR_PORT": str(free_port()),
+            "SMSR_WORKER_CPUS": "1",
+            "AWS_SECRET_ACCESS_KEY": "secret",
+        },
+        (folder / "compose.yaml", folder / "compose.s3.yaml", Path(__file__).parent / "s3.yaml"),
+    )
+    try:
+        compose("build", "s3", timeout=1200)
+        compose("up", "--detach", "--wait", "--no-build", "api", "worker")
+        with Client(f"http://127.0.0.1:{compose.settings['SMSR_PORT']}") as client:
+            sender = Sender(client, tmp_path)
+            example = make_example(frames=20, side=10)
+            job = client.wait(sender.send(example.measurements).id, timeout=120)
+            assert job.status == "succeeded", job.problem
+            assert sender.result(job)["shapes"].shape == example.ground_truth.shape
+        program = "import urllib.request as u; print(u.urlopen('http://127.0.0.1:8333/smsr').read().decode())"
+        listed = docker("exec", compose.container("s3"), "/opt/s3/bin/python", "-c", program)
+        keys = re.findall(r"<Key>([^<]+)</Key>", listed)
+        assert f"uploads/{job.id}/measurements" in keys
+        assert f"results/{job.id}/1/shapes.npy" in keys
+        on_disk = docker("exec", compose.container("worker"), "ls", "/data").split()
+        assert "objects" not in on_disk
+    finally:
+        log.info("logs:\n%s", compose("logs", "--no-color", "--tail", "100", check=False))
+        compose("down", "--volumes")
+    assert not any(compose.leftovers().values())
 
 
 def test_all_compose_files_are_valid() -> None:
