@@ -58,21 +58,6 @@ def left_jacobian(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return jacobian
 
 
-def mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the chordal mean (3, 3) of rotations (T, 3, 3): the rotation nearest to their sum."""
-    left, _, right = np.linalg.svd(rotations.sum(axis=0))
-    left[:, 2] *= np.linalg.det(left @ right)
-    mean: NDArray[np.float64] = left @ right
-    return mean
-
-
-def angles_to(
-    rotations: NDArray[np.float64], reference: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the angles (T,), radians, between rotations (T, 3, 3) and one rotation (3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotations @ reference.T).magnitude())
-
-
 def mirror(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the cameras that see the shape mirrored in its depth at the identity camera.
 

@@ -67,7 +67,7 @@ def fit_uniform_turn(
     centre = frames // 2
     time = np.arange(frames) - centre
     velocity = np.median(so3.log(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)), axis=0)
-    middle = rotations[centre]
+    middle = _most_central(rotations, velocity)
     window = 4
     while window < frames:
         window = min(2 * window, frames)
@@ -88,6 +88,19 @@ def fit_uniform_turn(
             velocity = velocity + step[:3]
             middle = so3.exp(step[None, 3:])[0] @ middle
     return velocity, middle
+
+
+def _most_central(
+    rotations: NDArray[np.float64], velocity: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return, of the cameras near the middle turned back to it, the one nearest to all others."""
+    frames = len(rotations)
+    first = max(0, frames // 2 - 4)
+    near = slice(first, first + 9)
+    back = turning_cameras(-velocity, np.eye(3), frames)[near] @ rotations[near]
+    distances = np.linalg.norm(back[:, None] - back, axis=(2, 3)).sum(axis=1)
+    central: NDArray[np.float64] = back[distances.argmin()]
+    return central
 
 
 def refine_uniform_turn(

@@ -1,0 +1,287 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from smsr import rotations as so3
+from smsr.cameras.constraints import (
+    frame_products,
+    orthonormality_form,
+    symmetric_matrix,
+    symmetric_vector,
+)
+from smsr.cameras.estimate import scaled_motion, usable_rank
+from smsr.cameras.gauge import fix_gauge
+from smsr.cameras.paper import published_cameras, thresholded_factor
+from smsr.cameras.relaxed import relaxed_cameras, relaxed_factor
+from smsr.cameras.selection import part_outside_span, with_uniform_turn
+from smsr.cameras.uniform import fit_uniform_turn, refine_uniform_turn, turning_cameras
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+
+cp: Any = pytest.importorskip("cvxpy")
+
+
+def low_rank(
+    rotations: Array, points: int = 30, modes: int = 1, amplitude: float = 0.15, seed: int = 0
+) -> tuple[Array, Array]:
+    """Return left singular vectors and singular values of a deforming shape under cameras."""
+    rng = np.random.default_rng(seed)
+    frames = len(rotations)
+    time = np.linspace(0.0, 1.0, frames)[:, None]
+    weights = amplitude * np.sin(2 * np.pi * (time * rng.uniform(1, 4, modes) + rng.random(modes)))
+    basis = rng.standard_normal((modes + 1, 3, points))
+    shapes = basis[0] + np.tensordot(weights, basis[1:], axes=1)
+    W = (rotations[:, :2] @ shapes).reshape(2 * frames, points)
+    U, s, _ = np.linalg.svd(W - W.mean(axis=1, keepdims=True), full_matrices=False)
+    kept = s > 1e-10 * s[0]
+    return U[:, kept], s[kept] / s[0]
+
+
+def orbit(frames: int = 60, degrees: float = 4.0) -> Array:
+    """Return rotations of constant velocity about a tilted axis."""
+    axis = np.array([0.2, 1.0, 0.1])
+    angles = np.radians(degrees) * np.arange(frames)
+    return np.asarray(
+        Rotation.from_rotvec(angles[:, None] * axis / np.linalg.norm(axis)).as_matrix()
+    )
+
+
+def swing(frames: int = 60) -> Array:
+    """Return rotations that swing to and fro about two axes."""
+    time = np.linspace(0.0, 1.0, frames)
+    yaw, pitch = 0.9 * np.sin(9 * time), 0.5 * np.cos(14 * time)
+    return np.asarray(Rotation.from_euler("yx", np.stack([yaw, pitch], axis=1)).as_matrix())
+
+
+def camera_error(found: Array, true: Array) -> float:
+    """Return the largest difference of cameras after the best turn or mirror of the object."""
+    errors = []
+    for candidate in (found, so3.mirror(found)):
+        U, _, Vt = np.linalg.svd(np.einsum("tij,tik->jk", candidate, true))
+        Q = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        errors.append(float(np.abs(candidate @ Q - true).max()))
+    return min(errors)
+
+
+def assert_cameras(rotations: Array) -> None:
+    eye = np.broadcast_to(np.eye(3), rotations.shape)
+    np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), eye, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0)
+
+
+def random_symmetric(n: int, seed: int = 0) -> Array:
+    A = np.random.default_rng(seed).standard_normal((n, n))
+    return np.asarray(A + A.T)
+
+
+class TestConstraints:
+    def test_coordinates_of_symmetric_matrices_keep_inner_products(self) -> None:
+        F, G = random_symmetric(7, 1), random_symmetric(7, 2)
+        assert symmetric_vector(F) @ symmetric_vector(G) == pytest.approx((F * G).sum())
+        np.testing.assert_allclose(symmetric_matrix(symmetric_vector(F)), F, atol=1e-14)
+
+    def test_frame_products_are_the_bilinear_forms(self) -> None:
+        M = np.random.default_rng(0).standard_normal((10, 6))
+        F = random_symmetric(6)
+        G = M @ F @ M.T
+        uu, vv, uv = (product @ symmetric_vector(F) for product in frame_products(M))
+        np.testing.assert_allclose(uu, np.diag(G)[0::2])
+        np.testing.assert_allclose(vv, np.diag(G)[1::2])
+        np.testing.assert_allclose(uv, np.diag(G, 1)[0::2])
+
+    @pytest.mark.parametrize("frames", [4, 700])
+    def test_published_form_is_the_residual_of_the_constraints(self, frames: int) -> None:
+        M = np.random.default_rng(0).standard_normal((2 * frames, 6))
+        F = random_symmetric(6)
+        form = orthonormality_form(M, unit_scale=False)
+        direct = 0.0
+        for u, v in zip(M[0::2], M[1::2], strict=True):
+            direct += (u @ F @ u - v @ F @ v) ** 2 + 2 * (u @ F @ v) ** 2
+        f = symmetric_vector(F)
+        assert form.residual(f) == pytest.approx(direct)
+        np.testing.assert_allclose(form.hessian, form.hessian.T, atol=1e-9)
+        assert form.lipschitz >= np.linalg.eigvalsh(form.hessian)[-1]
+
+    def test_unit_form_is_the_distance_of_the_gram_matrices_from_the_identity(self) -> None:
+        M = np.random.default_rng(0).standard_normal((40, 6))
+        F = random_symmetric(6)
+        form = orthonormality_form(M, unit_scale=True)
+        grams = np.array([M[i : i + 2] @ F @ M[i : i + 2].T for i in range(0, 40, 2)])
+        assert form.residual(symmetric_vector(F)) == pytest.approx(((grams - np.eye(2)) ** 2).sum())
+
+    @pytest.mark.parametrize("unit_scale", [False, True])
+    def test_gradient_is_half_the_derivative_of_the_residual(self, unit_scale: bool) -> None:
+        M = np.random.default_rng(0).standard_normal((20, 5))
+        form = orthonormality_form(M, unit_scale=unit_scale)
+        f, d = symmetric_vector(random_symmetric(5)), symmetric_vector(random_symmetric(5, 1))
+        h = 1e-6
+        slope = (form.residual(f + h * d) - form.residual(f - h * d)) / (4 * h)
+        assert form.gradient(f) @ d == pytest.approx(slope, rel=1e-6)
+
+
+class TestRelaxed:
+    @pytest.mark.parametrize("modes", [0, 1])
+    def test_cameras_of_a_low_rank_shape_are_found(self, modes: int) -> None:
+        true = swing()
+        estimate = relaxed_cameras(*low_rank(true, modes=modes))
+        assert estimate.converged
+        assert_cameras(estimate.rotations)
+        assert camera_error(estimate.rotations, true) < 0.05
+
+    def test_less_trace_less_bias(self) -> None:
+        true = swing()
+        errors = [
+            camera_error(
+                relaxed_cameras(*low_rank(true, modes=0), trace_weight=weight).rotations, true
+            )
+            for weight in (1e-1, 1e-3, 1e-5)
+        ]
+        assert errors[0] > errors[1] > errors[2]
+        assert errors[2] < 1e-4
+
+    def test_factor_solves_the_convex_problem(self) -> None:
+        left, values = low_rank(swing(12), points=12, modes=1)
+        M = scaled_motion(left, values, 6)
+        F, _ = relaxed_factor(M, trace_weight=0.05, tolerance=1e-9, max_iterations=5000)
+        variable = cp.Variable((6, 6), PSD=True)
+        fit = sum(
+            cp.sum_squares(M[i : i + 2] @ variable @ M[i : i + 2].T - np.eye(2))
+            for i in range(0, 24, 2)
+        )
+        problem = cp.Problem(cp.Minimize(0.5 * fit + 0.05 * 12 * cp.trace(variable)))
+        problem.solve(solver=cp.SCS, eps=1e-9)
+        np.testing.assert_allclose(F, variable.value, atol=1e-4)
+
+    def test_factor_is_semidefinite_and_practically_of_rank_3(self) -> None:
+        left, values = low_rank(swing(), modes=1)
+        F, residuals = relaxed_factor(scaled_motion(left, values, len(values)))
+        spectrum = np.linalg.eigvalsh(F)
+        assert spectrum[0] >= -1e-12
+        assert spectrum[-4] < 0.05 * spectrum[-3]
+        assert residuals[-1] < 1e-6
+
+    def test_it_reports_and_can_be_stopped(self) -> None:
+        left, values = low_rank(swing())
+        seen: list[float] = []
+
+        def hook(fraction: float, iteration: int, residual: float | None) -> None:
+            seen.append(fraction)
+            if iteration == 5:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            relaxed_cameras(left, values, hook=hook)
+        assert len(seen) == 5
+
+    def test_rank_is_a_multiple_of_three_where_it_can(self) -> None:
+        assert usable_rank(np.ones(14), 30) == 12
+        assert usable_rank(np.ones(40), 30) == 30
+        assert usable_rank(np.array([1.0, 0.5]), 30) == 2
+        assert usable_rank(np.array([1.0, 0.5, 0.1, 1e-12]), 30) == 3
+
+
+class TestPublished:
+    @pytest.mark.parametrize("modes", [0, 1, 2])
+    def test_cameras_and_basis_size_of_a_low_rank_shape_are_found(self, modes: int) -> None:
+        true = swing()
+        estimate = published_cameras(*low_rank(true, modes=modes))
+        assert estimate.basis_size == modes + 1
+        assert_cameras(estimate.rotations)
+        assert camera_error(estimate.rotations, true) < 0.1
+
+    def test_factor_has_rank_3_and_steps_do_not_raise_the_residual(self) -> None:
+        left, values = low_rank(swing(), modes=2)
+        M = scaled_motion(left, values, 9)
+        start = np.eye(9)
+        residuals = []
+        for steps in (1, 5, 25, 125):
+            F, residual, changes = thresholded_factor(M, start, max_iterations=steps, tolerance=0.0)
+            spectrum = np.linalg.eigvalsh(F)
+            assert spectrum[:-3] == pytest.approx(0.0, abs=1e-10)
+            assert spectrum[-3] > -1e-12
+            assert len(changes) == steps
+            residuals.append(residual)
+        assert residuals == sorted(residuals, reverse=True)
+
+    def test_a_given_basis_size_is_used(self) -> None:
+        estimate = published_cameras(*low_rank(swing(), modes=2), basis_size=2)
+        assert estimate.basis_size == 2
+
+
+class TestUniform:
+    @pytest.mark.parametrize("degrees", [0.5, 5.0, 40.0])
+    def test_fit_recovers_a_uniform_turn(self, degrees: float) -> None:
+        true = orbit(101, degrees)
+        velocity, middle = fit_uniform_turn(true)
+        np.testing.assert_allclose(turning_cameras(velocity, middle, 101), true, atol=1e-7)
+
+    def test_fit_is_little_disturbed_by_outliers(self) -> None:
+        true = orbit(100)
+        spoilt = true.copy()
+        spoilt[::10] = Rotation.random(10, random_state=0).as_matrix()
+        velocity, middle = fit_uniform_turn(spoilt)
+        assert np.abs(turning_cameras(velocity, middle, 100) - true).max() < 0.1
+
+    def test_refinement_brings_the_velocity_nearer(self) -> None:
+        true = orbit(60)
+        left, values = low_rank(true, modes=2)
+        velocity, middle = fit_uniform_turn(true)
+        off = velocity + np.radians([0.05, 0.1, -0.05])
+        refined = refine_uniform_turn(left * values, off, middle, motion_weight=0.1)
+        assert np.linalg.norm(refined - velocity) < 0.3 * np.linalg.norm(off - velocity)
+
+    def test_a_uniform_turn_is_recognised(self) -> None:
+        true = orbit(80)
+        left, values = low_rank(true, modes=2)
+        estimate = with_uniform_turn(relaxed_cameras(left, values), left, values)
+        assert estimate.model == "uniform"
+        assert camera_error(estimate.rotations, true) < 0.03
+
+    @pytest.mark.parametrize("amplitude", [0.1, 0.3])
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_another_motion_is_left_alone(self, amplitude: float, seed: int) -> None:
+        wobble = np.radians(14 * np.sin(np.arange(80) / 6.0))
+        pitch = Rotation.from_rotvec(wobble[:, None] * np.array([1.0, 0.0, 0.0])).as_matrix()
+        for true in (swing(80), pitch @ orbit(80)):
+            left, values = low_rank(true, modes=2, amplitude=amplitude, seed=seed)
+            free = relaxed_cameras(left, values)
+            estimate = with_uniform_turn(free, left, values)
+            assert estimate.model == "relaxed"
+            np.testing.assert_array_equal(estimate.rotations, free.rotations)
+            assert "uniform turn" in estimate.reason
+
+    def test_it_can_be_forced(self) -> None:
+        left, values = low_rank(swing(20))
+        free = relaxed_cameras(left, values)
+        assert with_uniform_turn(free, left, values, force=True).model == "uniform"
+
+    def test_true_cameras_lie_in_the_span_of_the_measurements(self) -> None:
+        left, _ = low_rank(swing(), modes=2)
+        assert part_outside_span(left, swing()) < 1e-10
+        assert part_outside_span(left, orbit()) > 0.2
+
+
+class TestGauge:
+    def test_middle_camera_becomes_the_identity_and_motion_stays(self) -> None:
+        G = swing(21)
+        fixed = fix_gauge(G)
+        np.testing.assert_allclose(fixed[10], np.eye(3), atol=1e-12)
+        assert camera_error(fixed, G) < 1e-12
+
+    def test_object_frame_and_mirror_image_do_not_matter(self) -> None:
+        G = swing(30)
+        turn = Rotation.random(random_state=3).as_matrix()
+        for same in (G @ turn, so3.mirror(G), so3.mirror(G) @ turn):
+            np.testing.assert_allclose(fix_gauge(same), fix_gauge(G), atol=1e-12)
+
+    def test_still_camera(self) -> None:
+        still = np.broadcast_to(np.eye(3), (5, 3, 3))
+        np.testing.assert_allclose(fix_gauge(still), still)
