@@ -211,7 +211,8 @@ class JobQueue:
         try:
             Job.fetch(ticket, connection=self.redis, serializer=JSONSerializer).delete()
         except (NoSuchJobError, InvalidJobOperation, ValueError):
-            # InvalidJobOperation: its worker has just finished and removed it. ValueError: the execution's own hash has expired before its entry in the registry.
+            # InvalidJobOperation: its worker has just finished and removed it.
+            # ValueError: the execution's own hash has expired before its entry in the registry.
             self.redis.delete(Job.key_for(ticket))
 
     # Keeping order

@@ -7,6 +7,7 @@ folders that became empty go away.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hashlib
 import os
@@ -121,11 +122,16 @@ class ObjectStorage:
         StorageError
         """
         meter = _Meter(limit)
-        with _failures(key):
-            await obstore.put_async(
-                self._store, _checked(key), meter.measure(chunks), chunk_size=PART_BYTES
-            )
-            await self._make_durable_async(key)
+        try:
+            with _failures(key):
+                await obstore.put_async(
+                    self._store, _checked(key), meter.measure(chunks), chunk_size=PART_BYTES
+                )
+                await asyncio.to_thread(self._make_durable, key)
+        except StorageError:
+            if meter.broken is not None:
+                raise meter.broken from None
+            raise
         return StoredObject(key, meter.bytes, meter.sha256.hexdigest())
 
     def put_bytes(self, key: str, data: bytes) -> None:
@@ -182,12 +188,6 @@ class ObjectStorage:
             path = self._local(key)
             _sync(path)
             _sync(path.parent)
-
-    async def _make_durable_async(self, key: str) -> None:
-        if self.folder is not None:
-            import asyncio
-
-            await asyncio.to_thread(self._make_durable, key)
 
     # Reading
 
@@ -372,15 +372,21 @@ class _Meter:
         self.limit = limit
         self.bytes = 0
         self.sha256 = hashlib.sha256()
+        self.broken: OSError | None = None
+        """An error of the source that must not be taken for one of the storage."""
 
     async def measure(self, chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
-        async for chunk in chunks:
-            self.bytes += len(chunk)
-            if self.limit is not None and self.bytes > self.limit:
-                raise UploadTooLarge(self.limit)
-            self.sha256.update(chunk)
-            if chunk:
-                yield bytes(chunk)
+        try:
+            async for chunk in chunks:
+                self.bytes += len(chunk)
+                if self.limit is not None and self.bytes > self.limit:
+                    raise UploadTooLarge(self.limit)
+                self.sha256.update(chunk)
+                if chunk:
+                    yield bytes(chunk)
+        except OSError as error:
+            self.broken = error
+            raise
 
 
 def _range(start: int, length: int | None) -> obstore.GetOptions:
