@@ -72,6 +72,15 @@ def serving(folder: Path, *arguments: str, environment: Mapping[str, str]) -> It
 
 
 @pytest.fixture(scope="session")
+def evaluation_data() -> Path:
+    """Folder of the evaluation data; tests that use it carry the marker `data`."""
+    folder = Path(os.environ.get("SMSR_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A server with one worker, shared by the tests of a process; jobs of others may be on it."""
     folder = tmp_path_factory.mktemp("served")

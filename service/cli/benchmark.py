@@ -12,6 +12,7 @@ from rich.table import Table
 from service.cli.bars import progress_bars
 from service.cli.exits import console
 from service.cli.local import AsJson, OptionValues, Preset, preset_and_options
+from service.cli.option_values import read
 from smsr.benchmark import (
     DATASETS,
     METHODS,
@@ -50,6 +51,12 @@ def benchmark(
     ] = None,
     preset: Preset = None,
     option: OptionValues = None,
+    also: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE", help="Measure with this option too, as a row more; repeatable."
+        ),
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="BLAS threads.")] = 1,
     as_json: AsJson = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown tables.")] = False,
@@ -59,26 +66,37 @@ def benchmark(
     Each set runs in a process of its own, one after the other.
     """
     values = preset_and_options(Options, preset, option)
-    parse(Options, values)
+    variants = {"": values}
+    for assignment in also or []:
+        variants[assignment] = values | read(Options, [assignment])
+    for options in variants.values():
+        parse(Options, options)
     chosen = DATASETS if sets is None else select(name.strip() for name in sets.split(","))
-    measured = []
+    measured: dict[str, list[Measurement]] = {}
     with progress_bars() as bars:
-        bar = bars.add_task("measuring", total=len(chosen), stage="")
-        for dataset in chosen:
-            bars.update(bar, stage=dataset.name)
-            measured.append(run(dataset, data, options=values, threads=threads))
-            bars.advance(bar)
+        bar = bars.add_task("measuring", total=len(variants) * len(chosen), stage="")
+        for variant, options in variants.items():
+            measured[variant] = []
+            for dataset in chosen:
+                bars.update(bar, stage=f"{dataset.name} {variant}")
+                measured[variant].append(run(dataset, data, options=options, threads=threads))
+                bars.advance(bar)
+        bars.update(bar, stage="")
     where = environment(threads)
     if as_json:
         console.print_json(
             data={
                 "environment": dataclasses.asdict(where),
                 "options": values,
-                "sets": [dataclasses.asdict(one) for one in measured],
+                "sets": [dataclasses.asdict(one) for one in measured.pop("")],
+                "also": {
+                    variant: [dataclasses.asdict(one) for one in sets_of_it]
+                    for variant, sets_of_it in measured.items()
+                },
             }
         )
         return
-    accuracy, cost = accuracy_rows(chosen, measured), cost_rows(measured)
+    accuracy, cost = accuracy_rows(chosen, measured), cost_rows(measured[""])
     if markdown:
         text = "\n\n".join((_markdown(accuracy), _markdown(cost), footnote(where)))
         console.print(text, markup=False, soft_wrap=True)
@@ -90,18 +108,30 @@ def benchmark(
         console.print(f"{method}: {source}", style="dim")
 
 
-def accuracy_rows(datasets: Sequence[Dataset], measured: Sequence[Measurement]) -> list[list[str]]:
-    """Return e3D of every method on every set; the first row names the sets."""
-    rows = [["e3D", *(one.name for one in measured)]]
+def accuracy_rows(
+    datasets: Sequence[Dataset], measured: Mapping[str, Sequence[Measurement]]
+) -> list[list[str]]:
+    """Return e3D of every method on every set; the first row names the sets.
+
+    Of the variants that were measured too, only the frame of the ground truth is shown.
+    """
+    ours = measured[""]
+    rows = [["e3D", *(one.name for one in ours)]]
     for method, figures in PUBLISHED.items():
-        cells = [_published(figures, one.name) for one in measured]
+        cells = [_published(figures, one.name) for one in ours]
         if any(cells):
             rows.append([method, *cells])
     for frame in ("object", "camera"):
-        cells = [_number(one.e3d.get(frame)) for one in measured]
-        rows.append([f"{OURS}, {frame} frame", *cells])
-    own = [_number(one.e3d_per_frame[d.frame]) for d, one in zip(datasets, measured, strict=True)]
-    rows.append([f"{OURS}, each frame aligned", *own])
+        cells = [_number(one.e3d.get(frame)) for one in ours]
+        if any(cells):
+            rows.append([f"{OURS}, {frame} frame", *cells])
+    frames = [dataset.frame for dataset in datasets]
+    alone = [_number(one.e3d_per_frame[f]) for f, one in zip(frames, ours, strict=True)]
+    rows.append([f"{OURS}, each frame aligned", *alone])
+    for variant, results in measured.items():
+        if variant:
+            cells = [_number(one.e3d[f]) for f, one in zip(frames, results, strict=True)]
+            rows.append([f"{OURS}, {variant}", *cells])
     return rows
 
 
@@ -159,5 +189,5 @@ def _table(rows: Sequence[Sequence[str]]) -> Table:
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
     head, *body = rows
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in body])

@@ -45,7 +45,7 @@ def demo(
     metrics = job.metrics or {}
     console.print(
         f"[bold]e3D = {metrics['e3d']:.4f}[/] ({job.frames} frames of {job.points} points, "
-        f"{job.timings['total']:.1f} s)"
+        f"{job.timings['total'] - job.timings['queued']:.1f} s)"
     )
     console.print(f"{out}/result.npz, {out}/report.json, {out}/frames/*.ply", soft_wrap=True)
 

@@ -296,11 +296,8 @@ def test_serve_says_that_a_port_is_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
-def test_benchmark_measures_a_set_in_its_own_process() -> None:
-    data = Path(os.environ.get("SMSR_DATA", Path(__file__).parents[3] / "shared" / "data"))
-    if not (data / "sparse" / "yoga.mat").is_file():
-        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
-    run = smsr("benchmark", "--data", data, "--sets", "yoga,dinosaur", "--json")
+def test_benchmark_measures_a_set_in_its_own_process(evaluation_data: Path) -> None:
+    run = smsr("benchmark", "--data", evaluation_data, "--sets", "yoga,dinosaur", "--json")
     report = json.loads(succeeded(run))
     yoga, dinosaur = report["sets"]
     assert (yoga["frames"], yoga["points"]) == (307, 41)
