@@ -1,0 +1,139 @@
+"""The HTTP application."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import asynccontextmanager, suppress
+from typing import TYPE_CHECKING
+
+from anyio import to_thread
+from fastapi_offline import FastAPIOffline
+
+import smsr
+from service import problems
+from service.context import Context
+from service.downloads import OpenResults
+from service.lingering import LingeringClose
+from service.routes import health, info, jobs, results
+from service.routes import problems as problem_pages
+from worker.changes import ChangeFeed
+from worker.connections import connect_async
+from worker.maintenance import Maintenance
+from worker.queue import JobQueue
+from worker.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from fastapi import FastAPI
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+_log = logging.getLogger(__name__)
+
+_DESCRIPTION = """
+Send the 2D point tracks of a deforming object, filmed by one camera; get back the moving 3D
+surface.
+
+1. `POST /v1/jobs` with the measurement file, and ground truth and faces where there are some.
+2. `GET /v1/jobs/{id}` with `Prefer: wait=30` until `status` is `succeeded`.
+3. Download `result.npz`, single frames as PLY or all of them as a ZIP.
+
+Every error is a problem document (RFC 9457) with a stable `type`; `/problems` documents all types.
+"""
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """Return the application; it connects when its lifespan begins.
+
+    Redis need not answer by then: until it does, requests get 503 and /readyz says why. No workers
+    are started here.
+
+    Parameters
+    ----------
+    settings : Settings
+        `redis_url` must be set.
+
+    Raises
+    ------
+    ValueError
+        The settings name no Redis server.
+    """
+    if settings.redis_url is None:
+        raise ValueError("the service needs the address of a Redis server")
+    redis_url = settings.redis_url
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        queue = JobQueue(settings)
+        async with connect_async(redis_url) as redis, ChangeFeed(redis) as feed:
+            app.state.context = Context(settings, queue, feed, OpenResults(queue.storage))
+            keeper = asyncio.create_task(_keep_order(queue), name="maintenance")
+            try:
+                yield
+            finally:
+                keeper.cancel()
+                with suppress(asyncio.CancelledError):
+                    await keeper
+                queue.redis.close()
+
+    app = FastAPIOffline(
+        redoc_url=None,
+        title="SMSR",
+        summary="Moving 3D surfaces from 2D point tracks of one camera.",
+        description=_DESCRIPTION,
+        version=smsr.__version__,
+        license_info={"name": "MIT", "identifier": "MIT"},
+        lifespan=lifespan,
+        responses={
+            "default": {
+                "description": "A problem document; see /problems for all types.",
+                "content": {problems.MEDIA_TYPE: {"schema": problems.SCHEMA}},
+            }
+        },
+    )
+    app.router.redirect_slashes = False
+    problems.install(app)
+    for routes in (jobs, results, info, health, problem_pages):
+        app.include_router(routes.router)
+    app.add_middleware(NoSniff)
+    app.add_middleware(LingeringClose)
+    return app
+
+
+def app_from_environment() -> FastAPI:
+    """Return the application with the settings of the environment.
+
+    For servers that take a factory, as in ``uvicorn --factory service.app:app_from_environment``.
+    """
+    return create_app(Settings())
+
+
+async def _keep_order(queue: JobQueue) -> None:
+    """Repair and tidy at start and ever after; the interval is that of the settings."""
+    keeper = Maintenance(queue)
+    while True:
+        try:
+            await to_thread.run_sync(keeper.run_once)
+        except Exception:  # noqa: BLE001  (a bug there must not end the service's care for jobs)
+            _log.exception("maintenance failed")
+        await asyncio.sleep(queue.settings.maintenance_interval_seconds)
+
+
+class NoSniff:
+    """Adds ``X-Content-Type-Options: nosniff``: an answer is what its type says, not a guess."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on."""
+
+        async def send_marked(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                name = b"x-content-type-options"
+                if all(key != name for key, _ in message["headers"]):
+                    message["headers"] = [*message["headers"], (name, b"nosniff")]
+            await send(message)
+
+        await self.app(scope, receive, send_marked if scope["type"] == "http" else send)

@@ -1,0 +1,505 @@
+"""Problem documents (RFC 9457): every error of the service has one form and a stable type.
+
+The catalogue below is the only place where a slug gets its HTTP status and its documentation; the
+pages under ``/problems`` and the responses in the OpenAPI document are made from it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, cast
+
+import redis.exceptions
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse
+from starlette.routing import compile_path
+
+from smsr import errors
+from worker import problems as worker_problems
+from worker.problems import InternalError, StorageUnavailable
+from worker.storage import ObjectMissing, StorageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from types import ModuleType
+
+    from fastapi import FastAPI
+    from starlette.requests import Request
+
+MEDIA_TYPE = "application/problem+json"
+SCHEMA = {"$ref": "#/components/schemas/ProblemDocument"}
+"""Of a problem document, in the OpenAPI document."""
+RETRY_SECONDS = 5
+"""What ``Retry-After`` says when Redis or the storage is away."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ProblemType:
+    """One kind of problem and its documentation.
+
+    Attributes
+    ----------
+    slug : str
+        Last part of the type URI ``/problems/<slug>``.
+    title : str
+        What is wrong in general; the same for every occurrence.
+    status : int
+        HTTP status of an answer of this type.
+    meaning : str
+        When this happens.
+    remedy : str
+        What a client or its user can do.
+    """
+
+    slug: str
+    title: str
+    status: int
+    meaning: str
+    remedy: str
+
+    @property
+    def uri(self) -> str:
+        """The type URI, relative to the service."""
+        return f"/problems/{self.slug}"
+
+
+class Problem(Exception):
+    """A refusal of the service itself, to be answered as a problem document.
+
+    Parameters
+    ----------
+    slug : str
+        A key of `CATALOGUE`.
+    detail : str
+        What is wrong in this request and what would be right.
+    headers : mapping, optional
+        More headers of the answer.
+    **context : object
+        Machine-readable facts, members of the document.
+    """
+
+    def __init__(
+        self,
+        slug: str,
+        detail: str,
+        *,
+        headers: Mapping[str, str] | None = None,
+        **context: object,
+    ) -> None:
+        super().__init__(detail)
+        self.type = CATALOGUE[slug]
+        self.detail = detail
+        self.headers = dict(headers or {})
+        self.context = context
+
+
+_OF_THE_SERVICE = (
+    ProblemType(
+        "not-found",
+        "There is nothing at this address",
+        404,
+        "No route of the service has this path.",
+        "See /docs for the routes. Paths have no trailing slash.",
+    ),
+    ProblemType(
+        "method-not-allowed",
+        "This address does not take this method",
+        405,
+        "The path exists, but not with this HTTP method.",
+        "The Allow header of the answer names the methods that the path takes.",
+    ),
+    ProblemType(
+        "invalid-request",
+        "A parameter of the request is not valid",
+        422,
+        "A query parameter or a part of the path has the wrong type or is out of its range.",
+        "The member `errors` says for each parameter where it stands and what is wrong.",
+    ),
+    ProblemType(
+        "unknown-job",
+        "There is no such job",
+        404,
+        "No job has this id: it never existed, was deleted, or its time to live has passed.",
+        "Check the id. Deleted and expired jobs cannot be brought back; submit again.",
+    ),
+    ProblemType(
+        "unknown-frame",
+        "There is no such frame",
+        404,
+        "The job has a result, but not a frame of this number.",
+        "Frames count from 0; the member `frames` says how many there are.",
+    ),
+    ProblemType(
+        "unknown-problem",
+        "There is no such problem type",
+        404,
+        "No problem type of the service has this name.",
+        "See /problems for all of them.",
+    ),
+    ProblemType(
+        "unsupported-media-type",
+        "The body is not multipart/form-data",
+        415,
+        "Jobs are submitted as multipart/form-data (RFC 7578) with a boundary.",
+        "Send the measurement file as the part `measurements`, for instance with "
+        "`curl -F measurements=@tracks.npy`.",
+    ),
+    ProblemType(
+        "malformed-multipart",
+        "The multipart body cannot be read",
+        400,
+        "The body ends early, or its boundaries or part headers break RFC 7578.",
+        "Let an HTTP library build the body; check that nothing between client and service cuts "
+        "requests off.",
+    ),
+    ProblemType(
+        "missing-measurements",
+        "The part with the measurements is missing",
+        422,
+        "A job needs a part named `measurements` with a file in it.",
+        "Add the part `measurements`. `ground_truth`, `faces` and `options` are optional.",
+    ),
+    ProblemType(
+        "unknown-part",
+        "The body has a part that is not known",
+        422,
+        "Parts are `measurements`, `ground_truth`, `faces` and `options`; nothing else is read, "
+        "and a misspelt part is refused rather than ignored.",
+        "Rename or leave out the part.",
+    ),
+    ProblemType(
+        "duplicate-part",
+        "A part was sent twice",
+        422,
+        "Each part may stand in the body once.",
+        "Send one file for each part.",
+    ),
+    ProblemType(
+        "malformed-options",
+        "The options are not a JSON object",
+        422,
+        "The part `options` must be one JSON object of option names and values, in UTF-8, of at "
+        "most 64 KiB.",
+        'Send for instance {"layout": "stacked"}. GET /v1/info lists all options.',
+    ),
+    ProblemType(
+        "upload-too-large",
+        "The upload is larger than the limit",
+        413,
+        "The files of a job together may have `limit` bytes.",
+        "Send float32 rather than float64, fewer frames or fewer points, or ask the operator to "
+        "raise SMSR_MAX_UPLOAD_BYTES.",
+    ),
+    ProblemType(
+        "upload-stalled",
+        "The upload stopped",
+        408,
+        "No byte of the body arrived for a long time. Nothing of the upload was kept.",
+        "Submit again over a better connection.",
+    ),
+    ProblemType(
+        "job-unfinished",
+        "The job has no result yet",
+        409,
+        "The job is queued or running.",
+        "Ask again after the seconds in Retry-After, or wait for the job with "
+        "`GET /v1/jobs/{id}` and the header `Prefer: wait=30`.",
+    ),
+    ProblemType(
+        "job-failed",
+        "The job failed",
+        409,
+        "The job ended without a result. The member `cause` is the problem that ended it.",
+        "Read `cause`, correct the input or the options, and submit again.",
+    ),
+    ProblemType(
+        "job-cancelled",
+        "The job was cancelled",
+        410,
+        "The job was cancelled before it had a result, and will have none.",
+        "Submit again if the result is wanted after all.",
+    ),
+    ProblemType(
+        "job-finished",
+        "The job has finished",
+        409,
+        "Only a queued or running job can be cancelled.",
+        "DELETE /v1/jobs/{id} removes a finished job and its files.",
+    ),
+    ProblemType(
+        "queue-unavailable",
+        "The job queue cannot be reached",
+        503,
+        "The service runs, but its Redis server does not answer. Accepted jobs are not lost.",
+        "Try again after the seconds in Retry-After.",
+    ),
+    ProblemType(
+        "storage-unavailable",
+        StorageUnavailable.title,
+        503,
+        "The service runs, but cannot read or write its files; the disk may be full. Nothing of a "
+        "refused upload is kept.",
+        "Try again after the seconds in Retry-After; tell the operator if it lasts.",
+    ),
+    ProblemType(
+        "not-ready",
+        "The service is not ready",
+        503,
+        "Redis or the storage is not usable; the member `checks` says which and why.",
+        "Wait; tell the operator if it lasts.",
+    ),
+    ProblemType(
+        "result-gone",
+        "The files of this job are gone",
+        410,
+        "The job was deleted, or its time to live passed, while it was asked for.",
+        "Submit again.",
+    ),
+    ProblemType(
+        "internal",
+        InternalError.title,
+        500,
+        "An error that nobody foresaw. Its trace is in the service's log, never in an answer.",
+        "Try again; tell the operator the time and the address if it lasts.",
+    ),
+)
+
+_STATUS = {
+    "unsupported-format": 415,
+    "too-large": 413,
+    "numerical-failure": 500,
+    "cancelled": 410,
+    "worker-lost": 500,
+    "out-of-memory": 500,
+    "input-missing": 500,
+}
+
+_REMEDIES = {
+    "invalid-input": "Read `detail`, which says what would be right.",
+    "unsupported-format": "Send .npy, .npz, .mat or another format that GET /v1/info lists.",
+    "unreadable-file": "Write the file again, without pickled objects, and check that the copy is "
+    "complete.",
+    "empty-file": "Check the path that was uploaded.",
+    "array-not-found": "Store a numeric array, or name the right one with the option "
+    "`measurements_key`, `ground_truth_key` or `faces_key`.",
+    "ambiguous-array": "Name the array with the option `measurements_key`, `ground_truth_key` or "
+    "`faces_key`; `detail` lists the candidates.",
+    "too-large": "Send fewer points or frames, or ask the operator to raise SMSR_MAX_ARRAY_BYTES.",
+    "not-numeric": "Store the array as float32, float64 or integers.",
+    "wrong-shape": "Measurements are (2T, N), (T, 2, N) or (T, N, 2); ground truth is (T, N, 3) or "
+    "(3T, N); faces are (F, 3).",
+    "odd-row-count": "Give two rows, u and v, for every frame.",
+    "ambiguous-layout": "Say the row order with the option `layout`.",
+    "too-few-frames": "Give at least 3 frames; a usable surface needs dozens.",
+    "too-few-points": "Give at least 4 points.",
+    "not-finite": "Remove or fill the points that are not seen in every frame; `detail` says where "
+    "the first bad entry stands.",
+    "constant-measurements": "Check that the file holds tracks in pixels and was not cleared.",
+    "ground-truth-mismatch": "Give the true 3D points of the same frames and points, in the same "
+    "order.",
+    "invalid-faces": "Give triangles as rows of three point numbers, counted from 0.",
+    "unknown-option": "GET /v1/info lists all options.",
+    "invalid-option": "GET /v1/info lists type, range and choices of every option.",
+    "cancelled": "Submit again if the result is wanted after all.",
+    "numerical-failure": "Tell the operator the id of the job.",
+    "time-limit": "Raise the option `time_limit`, or send fewer points or frames.",
+    "worker-lost": "Try a smaller input; tell the operator the id of the job.",
+    "out-of-memory": "Send fewer frames or points, or ask the operator for more memory.",
+    "input-missing": "Submit again; tell the operator, since something else removes files.",
+}
+
+
+def _of_exceptions(module: ModuleType) -> list[ProblemType]:
+    """Turn the exceptions of a module of the lower floors into problem types."""
+    found = []
+    for error in vars(module).values():
+        if not inspect.isclass(error) or not issubclass(error, errors.SmsrError):
+            continue
+        if error is not errors.SmsrError:
+            meaning = inspect.cleandoc(error.__doc__ or "").partition("\n\n")[0]
+            found.append(
+                ProblemType(
+                    error.slug,
+                    error.title,
+                    _STATUS.get(error.slug, 422),
+                    meaning.replace("\n", " "),
+                    _REMEDIES.get(error.slug, "Read `detail`, which says what would be right."),
+                )
+            )
+    return found
+
+
+CATALOGUE: dict[str, ProblemType] = {
+    kind.slug: kind
+    for kind in (*_of_exceptions(errors), *_of_exceptions(worker_problems), *_OF_THE_SERVICE)
+}
+
+
+def example_responses(*slugs: str) -> dict[int | str, dict[str, Any]]:
+    """Return OpenAPI response objects, by status, with an example of each of some problems."""
+    responses: dict[int | str, dict[str, Any]] = {}
+    for slug in slugs:
+        kind = CATALOGUE[slug]
+        fresh = {"schema": SCHEMA, "examples": {}}
+        response = responses.setdefault(
+            kind.status, {"description": "", "content": {MEDIA_TYPE: fresh}}
+        )
+        response["description"] += f"{', ' * bool(response['description'])}{slug}"
+        response["content"][MEDIA_TYPE]["examples"][slug] = {
+            "summary": kind.title,
+            "value": {
+                "type": kind.uri,
+                "title": kind.title,
+                "status": kind.status,
+                "detail": kind.meaning,
+                "instance": "/v1/jobs",
+            },
+        }
+    return responses
+
+
+class ProblemResponse(JSONResponse):
+    """A problem document as the answer."""
+
+    media_type = MEDIA_TYPE
+
+
+def document(
+    kind: ProblemType, detail: str, instance: str, context: Mapping[str, object]
+) -> dict[str, Any]:
+    """Build a problem document; the members of RFC 9457 win over those of the context."""
+    return {
+        "type": kind.uri,
+        "title": kind.title,
+        "status": kind.status,
+        "detail": detail,
+        "instance": instance,
+    } | {k: v for k, v in context.items() if k not in _RESERVED}
+
+
+_RESERVED = frozenset({"type", "title", "status", "detail", "instance"})
+
+
+def respond(
+    request: Request,
+    kind: ProblemType,
+    detail: str,
+    context: Mapping[str, object] | None = None,
+    headers: Mapping[str, str] | None = None,
+) -> ProblemResponse:
+    """Answer a request with a problem document."""
+    body = document(kind, detail, request.url.path, context or {})
+    # Outside of all middleware for a 500, so it sets this header itself.
+    fixed = {"X-Content-Type-Options": "nosniff"}
+    return ProblemResponse(body, status_code=kind.status, headers=fixed | dict(headers or {}))
+
+
+async def _on_problem(request: Request, error: Exception) -> ProblemResponse:
+    found = cast("Problem", error)
+    return respond(request, found.type, found.detail, found.context, found.headers)
+
+
+async def _on_solver_error(request: Request, error: Exception) -> ProblemResponse:
+    found = cast("errors.SmsrError", error)
+    return respond(request, CATALOGUE[found.slug], found.detail, found.context)
+
+
+async def _on_invalid_request(request: Request, error: Exception) -> ProblemResponse:
+    found = [
+        {"in": str(e["loc"][0]), "name": ".".join(map(str, e["loc"][1:])), "detail": e["msg"]}
+        for e in cast("RequestValidationError", error).errors()
+    ]
+    detail = "; ".join(f"{e['in']} {e['name']}: {e['detail']}" for e in found)
+    return respond(request, CATALOGUE["invalid-request"], detail, {"errors": found})
+
+
+async def _on_http_error(request: Request, failure: Exception) -> ProblemResponse:
+    error = cast("HTTPException", failure)
+    if error.status_code == HTTPStatus.NOT_FOUND:
+        detail = f"The service has no {request.url.path}."
+        return respond(request, CATALOGUE["not-found"], detail)
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        allowed = ", ".join(_methods_of(request))
+        detail = f"{request.url.path} takes {allowed}, not {request.method}."
+        headers = {"Allow": allowed}
+        return respond(request, CATALOGUE["method-not-allowed"], detail, headers=headers)
+    # RFC 9457, section 4.2.1: "about:blank" says no more than the HTTP status does.
+    status = HTTPStatus(error.status_code)
+    body = {
+        "type": "about:blank",
+        "title": status.phrase,
+        "status": status.value,
+        "instance": request.url.path,
+    }
+    return ProblemResponse(body, status_code=status, headers=error.headers)
+
+
+def _methods_of(request: Request) -> list[str]:
+    """Return all methods of a path; the router knows those of the first route that fits only."""
+    path = request.scope["path"].removeprefix(request.scope.get("root_path", ""))
+    return sorted(
+        {
+            method.upper()
+            for template, operations in request.app.openapi()["paths"].items()
+            if compile_path(template)[0].match(path)
+            for method in operations
+        }
+    )
+
+
+async def _on_redis_away(request: Request, error: Exception) -> ProblemResponse:
+    _log.warning("Redis does not answer: %s", error)
+    return respond(
+        request,
+        CATALOGUE["queue-unavailable"],
+        "The job queue does not answer at the moment. Please try again.",
+        headers={"Retry-After": str(RETRY_SECONDS)},
+    )
+
+
+async def _on_storage_away(request: Request, error: Exception) -> ProblemResponse:
+    _log.error("The storage failed", exc_info=error)
+    return respond(
+        request,
+        CATALOGUE["storage-unavailable"],
+        "The files of the service cannot be read or written at the moment. Please try again.",
+        headers={"Retry-After": str(RETRY_SECONDS)},
+    )
+
+
+async def _on_object_missing(request: Request, _error: Exception) -> ProblemResponse:
+    return respond(
+        request, CATALOGUE["result-gone"], "The job and its files were removed a moment ago."
+    )
+
+
+async def _on_anything_else(request: Request, _error: Exception) -> ProblemResponse:
+    return respond(
+        request,
+        CATALOGUE["internal"],
+        "The request met an unexpected error, which has been logged.",
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of an application a problem document."""
+    app.add_exception_handler(Problem, _on_problem)
+    app.add_exception_handler(errors.SmsrError, _on_solver_error)
+    app.add_exception_handler(RequestValidationError, _on_invalid_request)
+    app.add_exception_handler(HTTPException, _on_http_error)
+    for away in (
+        redis.exceptions.ConnectionError,
+        redis.exceptions.TimeoutError,
+        redis.exceptions.ReadOnlyError,
+        redis.exceptions.OutOfMemoryError,
+    ):
+        app.add_exception_handler(away, _on_redis_away)
+    app.add_exception_handler(StorageError, _on_storage_away)
+    app.add_exception_handler(ObjectMissing, _on_object_missing)
+    app.add_exception_handler(Exception, _on_anything_else)

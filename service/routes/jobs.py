@@ -1,0 +1,315 @@
+"""Submitting, watching, cancelling and deleting jobs."""
+
+import dataclasses
+from typing import Annotated, Any
+from urllib.parse import urlencode
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, Query, Request, Response
+from redis.exceptions import RedisError
+from starlette.requests import ClientDisconnect
+
+from service.context import Context, JobId, Shared, root_of, unknown_job
+from service.downloads import diagnostics_of
+from service.problems import Problem, example_responses
+from service.schemas import Job, JobList, JobStatus, job_document
+from service.uploads import UploadLimits, discard_uploads, receive_submission
+from service.waiting import preferred_wait, wait_until_final
+from smsr.options import describe
+from worker.options import JobOptions
+from worker.records import JobActive, JobRecord, new_job_id
+from worker.storage import ObjectMissing
+
+PAGE_SIZE = 200
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+
+def _file(description: str) -> dict[str, Any]:
+    return {"type": "string", "format": "binary", "description": description}
+
+
+def _options_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the options, made from their descriptions."""
+    properties: dict[str, Any] = {}
+    for option in describe(JobOptions):
+        known = {
+            "type": [option.type, "null"] if option.nullable else option.type,
+            "default": option.default,
+            "description": option.help,
+            "minimum": option.minimum,
+            "maximum": option.maximum,
+            "enum": list(option.choices) if option.choices else None,
+        }
+        properties[option.name] = {
+            k: v for k, v in known.items() if v is not None or k == "default"
+        }
+    return {"type": "object", "additionalProperties": False, "properties": properties}
+
+
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["measurements"],
+                    "additionalProperties": False,
+                    "properties": {
+                        "options": _options_schema(),
+                        "measurements": _file(
+                            "2D tracks: a (2T, N) matrix of rows u1, v1, u2, v2, ..., or (T, 2, N) "
+                            "or (T, N, 2); GET /v1/info lists the formats."
+                        ),
+                        "ground_truth": _file(
+                            "True 3D points, (T, N, 3) or (3T, N): the result gets its e3D."
+                        ),
+                        "faces": _file("Triangles, (F, 3) point numbers from 0: results get them."),
+                    },
+                },
+                "encoding": {"options": {"contentType": "application/json"}},
+                "example": {"options": {"layout": "interleaved"}, "measurements": "@tracks.npy"},
+            }
+        },
+    }
+}
+
+
+@router.post(
+    "",
+    status_code=201,
+    summary="Submit a job",
+    openapi_extra=_BODY,
+    responses={
+        201: {"headers": {"Location": {"schema": {"type": "string"}, "description": "The job."}}},
+        **example_responses(
+            "malformed-multipart",
+            "upload-stalled",
+            "upload-too-large",
+            "too-large",
+            "unsupported-media-type",
+            "unsupported-format",
+            "missing-measurements",
+            "unknown-part",
+            "duplicate-part",
+            "malformed-options",
+            "unknown-option",
+            "invalid-option",
+            "odd-row-count",
+            "too-few-frames",
+            "too-few-points",
+            "not-numeric",
+            "empty-file",
+            "unreadable-file",
+            "queue-unavailable",
+            "storage-unavailable",
+        ),
+    },
+)
+async def submit(request: Request, response: Response, shared: Shared) -> Job:
+    """Upload tracks and queue their reconstruction.
+
+    The parts may come in any order. The beginning of each file is checked while it arrives, so
+    most unusable files are refused at once; what only shows in the whole file (an entry that is not
+    finite, a corrupt archive) makes the job fail with the same kind of problem document. Nothing of
+    a refused or broken upload is kept; the files of a job are kept until it expires or is deleted.
+    """
+    queue = shared.queue
+    await to_thread.run_sync(queue.redis.ping)  # before a long upload, not after it
+    job_id = new_job_id()
+    try:
+        submission = await receive_submission(
+            request,
+            job_id,
+            shared.storage,
+            UploadLimits(shared.settings.max_upload_bytes, shared.settings.max_array_bytes),
+        )
+    except ClientDisconnect:
+        raise Problem("malformed-multipart", "The client went away.") from None
+    record = JobRecord.new(
+        job_id,
+        options=dataclasses.asdict(submission.options),
+        inputs={str(role): file for role, file in submission.inputs.items()},
+        name=submission.inputs["measurements"].name,
+        frames=submission.frames,
+        points=submission.points,
+    )
+    record = await _enqueue(shared, record)
+    document = job_document(record, root=root_of(request))
+    response.headers["Location"] = document.links.self
+    return document
+
+
+async def _enqueue(shared: Context, record: JobRecord) -> JobRecord:
+    """Make a stored upload a job; Redis may go away at any moment."""
+    try:
+        return await to_thread.run_sync(shared.queue.submit, record)
+    except RedisError:
+        # A record without a place in the queue gets one by maintenance: it is accepted. Where not
+        # even that can be seen now, the files stay until maintenance knows whether there is one.
+        accepted = await to_thread.run_sync(shared.queue.records.get, record.id)
+        if accepted is not None:
+            return accepted
+        await discard_uploads(shared.storage, record.id)
+        raise
+
+
+@router.get(
+    "",
+    summary="List jobs, newest first",
+    responses={
+        200: {
+            "headers": {
+                "Link": {
+                    "schema": {"type": "string"},
+                    "description": 'The next page, rel="next" (RFC 8288), where there is one.',
+                }
+            }
+        },
+        **example_responses("invalid-request", "queue-unavailable"),
+    },
+)
+async def list_jobs(
+    request: Request,
+    response: Response,
+    shared: Shared,
+    status: Annotated[JobStatus | None, Query(description="Only jobs of this status.")] = None,
+    limit: Annotated[int, Query(ge=1, le=PAGE_SIZE, description="Jobs on a page.")] = 50,
+    cursor: Annotated[
+        str | None, Query(max_length=100, description="From `next` of the page before.")
+    ] = None,
+) -> JobList:
+    """Return one page of jobs. Jobs that come or go in between do not shift the pages."""
+    try:
+        page = await to_thread.run_sync(shared.queue.records.list, status, cursor, limit)
+    except ValueError:
+        raise Problem(
+            "invalid-request", f"query cursor: {cursor!r} was not given by a page before."
+        ) from None
+    root = root_of(request)
+    following = None
+    if page.next_cursor is not None:
+        query = {"status": status, "limit": limit, "cursor": page.next_cursor}
+        given = {name: value for name, value in query.items() if value is not None}
+        following = f"{root}/v1/jobs?{urlencode(given)}"
+        response.headers["Link"] = f'<{following}>; rel="next"'
+    return JobList(jobs=[job_document(r, root=root) for r in page.records], next=following)
+
+
+@router.get(
+    "/{job_id}",
+    summary="A job: status, progress, errors, links",
+    responses={
+        200: {
+            "headers": {
+                "Preference-Applied": {
+                    "schema": {"type": "string"},
+                    "description": "The wait that was applied, at most 60 seconds (RFC 7240).",
+                }
+            }
+        },
+        **example_responses("unknown-job", "queue-unavailable"),
+    },
+)
+async def get_job(
+    request: Request,
+    response: Response,
+    shared: Shared,
+    job_id: JobId,
+    prefer: Annotated[
+        list[str] | None,
+        Header(
+            description="`wait=N` answers when the job has ended, or after N seconds (RFC 7240).",
+            examples=["wait=30"],
+        ),
+    ] = None,
+) -> Job:
+    """Return a job, at once or when it has ended."""
+    record: JobRecord | None = await shared.record(job_id)
+    seconds = preferred_wait(prefer or ())
+    if seconds is not None and record is not None:
+        record = await wait_until_final(shared.feed, record, seconds)
+        response.headers["Preference-Applied"] = f"wait={seconds}"
+    if record is None:
+        raise unknown_job(job_id)
+    response.headers["Vary"] = "Prefer"
+    response.headers["Cache-Control"] = "no-store"
+    return await _whole_document(request, shared, record)
+
+
+async def _whole_document(request: Request, shared: Context, record: JobRecord) -> Job:
+    """Return the document of a job with what has to be looked up."""
+    position = None
+    diagnostics = None
+    if record.status == "queued":
+        position = await to_thread.run_sync(shared.queue.position, record.id)
+    if record.result_prefix is not None:
+        try:
+            key = f"{record.result_prefix}report.json"
+            report = await to_thread.run_sync(shared.storage.get, key)
+        except ObjectMissing:  # deleted a moment ago; the record says the rest
+            pass
+        else:
+            diagnostics = diagnostics_of(report)
+    return job_document(record, root=root_of(request), position=position, diagnostics=diagnostics)
+
+
+@router.delete(
+    "/{job_id}",
+    status_code=204,
+    summary="Delete a job and all its files",
+    responses=example_responses("unknown-job", "queue-unavailable"),
+)
+async def delete_job(shared: Shared, job_id: JobId) -> None:
+    """Remove a job, its inputs and its results; a running one is stopped."""
+    if not await to_thread.run_sync(shared.queue.delete, job_id):
+        raise unknown_job(job_id)
+
+
+@router.post(
+    "/{job_id}/cancel",
+    summary="Cancel a job",
+    responses={
+        200: {"description": "The job was queued and is cancelled."},
+        202: {
+            "model": Job,
+            "description": "The job runs and has been asked to stop, which takes seconds.",
+        },
+        **example_responses("unknown-job", "job-finished", "queue-unavailable"),
+    },
+)
+async def cancel_job(request: Request, response: Response, shared: Shared, job_id: JobId) -> Job:
+    """Stop a job that is queued or running; asking twice is no error."""
+    before = await shared.record(job_id)
+    record = await to_thread.run_sync(shared.queue.cancel, job_id)
+    if record is None:
+        raise unknown_job(job_id)
+    if record.status in ("succeeded", "failed") or before.status == "cancelled":
+        raise Problem(
+            "job-finished",
+            f"The job has {record.status}; there is nothing to cancel."
+            if record.status != "cancelled"
+            else "The job has been cancelled already.",
+            job_status=record.status,
+        )
+    if not record.final:
+        response.status_code = 202
+    return job_document(record, root=root_of(request))
+
+
+@router.post(
+    "/{job_id}/retry",
+    status_code=202,
+    summary="Run a finished job again",
+    responses=example_responses("unknown-job", "job-unfinished", "queue-unavailable"),
+)
+async def retry_job(request: Request, shared: Shared, job_id: JobId) -> Job:
+    """Queue a job that has ended once more, with the same files and options; its result goes."""
+    try:
+        record = await to_thread.run_sync(shared.queue.retry, job_id)
+    except JobActive:
+        raise Problem("job-unfinished", "The job is still queued or running.") from None
+    if record is None:
+        raise unknown_job(job_id)
+    return job_document(record, root=root_of(request))

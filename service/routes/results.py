@@ -1,0 +1,129 @@
+"""Downloading results."""
+
+from typing import Annotated, Any
+
+from anyio import to_thread
+from fastapi import APIRouter, Path, Response
+from starlette.responses import StreamingResponse
+
+from service.context import Context, JobId, Shared
+from service.downloads import ResultFiles, archive, attachment
+from service.problems import Problem, example_responses
+from worker.records import JobRecord
+
+RETRY_SECONDS = 2
+"""What ``Retry-After`` says while a job is queued or runs."""
+
+router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
+
+_PROBLEMS = example_responses(
+    "unknown-job",
+    "job-unfinished",
+    "job-failed",
+    "job-cancelled",
+    "result-gone",
+    "queue-unavailable",
+    "storage-unavailable",
+)
+
+
+def _binary(media_type: str, description: str) -> dict[str, Any]:
+    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    return {"description": description, "content": content}
+
+
+async def _finished(shared: Context, job_id: str) -> JobRecord:
+    """Return the record of a job that has a result."""
+    record = await shared.record(job_id)
+    match record.status:
+        case "queued" | "running":
+            raise Problem(
+                "job-unfinished",
+                f"The job is {record.status}.",
+                headers={"Retry-After": str(RETRY_SECONDS)},
+                job_status=record.status,
+            )
+        case "failed":
+            cause = dict(record.problem or {})
+            raise Problem(
+                "job-failed", f"The job failed: {cause.get('detail', '')}".strip(), cause=cause
+            )
+        case "cancelled":
+            raise Problem("job-cancelled", "The job was cancelled before it had a result.")
+    return record
+
+
+async def _open(shared: Context, job_id: str) -> ResultFiles:
+    record = await _finished(shared, job_id)
+    return await shared.results.open(record)
+
+
+@router.get(
+    "/result.npz",
+    summary="Shapes, cameras and translations as one NPZ",
+    response_class=StreamingResponse,
+    responses={200: _binary("application/zip", "Read it with numpy.load."), **_PROBLEMS},
+)
+async def get_npz(shared: Shared, job_id: JobId) -> StreamingResponse:
+    """Return arrays `shapes` (T, N, 3), `cameras` (T, 2, 3), `translations` (T, 2), and `faces`.
+
+    W_t = R_t S_t + t_t. The archive is not compressed; its length is known in advance.
+    """
+    files = await _open(shared, job_id)
+    return archive(files.npz_members(), name=f"smsr-{job_id}.npz", modified=files.finished)
+
+
+@router.get(
+    "/frames.zip",
+    summary="All frames as PLY in one ZIP",
+    response_class=StreamingResponse,
+    responses={200: _binary("application/zip", "frame_0000.ply and so on."), **_PROBLEMS},
+)
+async def get_frames(shared: Shared, job_id: JobId) -> StreamingResponse:
+    """Return every frame as a binary PLY, with the faces where faces were sent."""
+    files = await _open(shared, job_id)
+    return archive(files.ply_members(), name=f"smsr-{job_id}-frames.zip", modified=files.finished)
+
+
+@router.get(
+    "/frames/{frame}.ply",
+    summary="One frame as PLY",
+    response_class=StreamingResponse,
+    responses={
+        200: _binary("application/octet-stream", "Binary little-endian PLY."),
+        **_PROBLEMS,
+        **example_responses("unknown-job", "unknown-frame", "invalid-request"),
+    },
+)
+async def get_frame(
+    shared: Shared, job_id: JobId, frame: Annotated[int, Path(description="From 0.")]
+) -> StreamingResponse:
+    """Return the surface of one frame."""
+    files = await _open(shared, job_id)
+    if not 0 <= frame < files.frames:
+        raise Problem(
+            "unknown-frame",
+            f"There is no frame {frame}; the job has frames 0 to {files.frames - 1}.",
+            frames=files.frames,
+        )
+    return attachment(
+        files.ply(frame),
+        size=files.ply_size(),
+        name=f"smsr-{job_id}-frame-{frame:04d}.ply",
+        media_type="application/octet-stream",
+    )
+
+
+@router.get(
+    "/report.json",
+    summary="The whole report of a run",
+    responses={
+        200: {"content": {"application/json": {"schema": {"type": "object"}}}},
+        **_PROBLEMS,
+    },
+)
+async def get_report(shared: Shared, job_id: JobId) -> Response:
+    """Return all diagnostics: stages, residuals, singular values, cautions."""
+    record = await _finished(shared, job_id)
+    report = await to_thread.run_sync(shared.storage.get, f"{record.result_prefix}report.json")
+    return Response(report, media_type="application/json")

@@ -1,0 +1,329 @@
+"""The JSON documents of the service, and how records turn into them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smsr.options import OptionDescription
+    from worker.records import JobRecord
+
+JobStatus = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
+_ID = "0f8fad5bd9cb469fa16570867728950e"
+_SELF = f"/v1/jobs/{_ID}"
+
+
+class ProblemDocument(BaseModel):
+    """A problem document (RFC 9457); more members may stand in it."""
+
+    model_config = ConfigDict(
+        extra="allow",
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "/problems/odd-row-count",
+                    "title": "The measurement matrix has an odd number of rows",
+                    "status": 422,
+                    "detail": "The matrix has 7 rows; it needs two, u and v, for every frame.",
+                    "instance": "/v1/jobs",
+                }
+            ]
+        },
+    )
+
+    type: str = Field(description="Stable type; GET it for its documentation.")
+    title: str = Field(description="What is wrong in general.")
+    status: int = Field(description="HTTP status.")
+    detail: str | None = Field(None, description="What is wrong here and what would be right.")
+    instance: str | None = Field(None, description="Path of the request or of the job.")
+
+
+class InputFile(BaseModel):
+    """An uploaded file."""
+
+    name: str = Field(description="File name as it was sent, without folders.")
+    bytes: int
+    content_type: str | None
+    sha256: str = Field(description="Hexadecimal digest of the bytes that were stored.")
+
+
+class JobProgress(BaseModel):
+    """Last report of a run."""
+
+    stage: str
+    fraction: float = Field(description="Part of the run that is done, 0 to 1.")
+    iteration: int = Field(description="Iteration within the stage; 0 where it has none.")
+    residual: float | None = Field(description="Stopping residual of the stage, where it has one.")
+
+
+class JobCaution(BaseModel):
+    """A weakness of the input that the solver noticed."""
+
+    code: str
+    message: str
+
+
+class DiagnosticsSummary(BaseModel):
+    """How the result came about; report.json has the whole."""
+
+    converged: bool = Field(description="Whether every iterative stage met its tolerance.")
+    basis_size: int = Field(description="K, the number of basis shapes that was found.")
+    camera_model: str
+    camera_reason: str
+    cautions: list[JobCaution]
+
+
+class JobLinks(BaseModel):
+    """Where to go from a job; paths relative to the service, null where nothing is there (yet)."""
+
+    self: str
+    cancel: str | None
+    result: str | None = Field(description="result.npz")
+    frames: str | None = Field(description="ZIP of all frames as PLY")
+    frame: str | None = Field(description="URI template (RFC 6570) of one frame as PLY, t from 0")
+    report: str | None = Field(description="report.json")
+
+
+class Job(BaseModel):
+    """A job and all that is known of it."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": _ID,
+                    "status": "succeeded",
+                    "name": "tracks.npy",
+                    "created_at": "2026-03-01T12:00:00.120000Z",
+                    "started_at": "2026-03-01T12:00:00.180000Z",
+                    "finished_at": "2026-03-01T12:00:03.910000Z",
+                    "expires_at": "2026-03-08T12:00:03.910000Z",
+                    "attempt": 1,
+                    "queue_position": None,
+                    "cancel_requested": False,
+                    "options": {"preset": "default", "layout": "auto"},
+                    "inputs": {
+                        "measurements": {
+                            "name": "tracks.npy",
+                            "bytes": 2304128,
+                            "content_type": "application/octet-stream",
+                            "sha256": "9f86d081884c7d659a2feaa0c55ad015"
+                            "a3bf4f1b2b0b822cd15d6c15b0f00a08",
+                        }
+                    },
+                    "frames": 60,
+                    "points": 2400,
+                    "progress": {
+                        "stage": "shapes",
+                        "fraction": 1.0,
+                        "iteration": 42,
+                        "residual": 8.1e-7,
+                    },
+                    "timings": {"queued": 0.06, "total": 3.73},
+                    "metrics": {"e3d": 0.0312},
+                    "diagnostics": {
+                        "converged": True,
+                        "basis_size": 5,
+                        "camera_model": "orthographic",
+                        "camera_reason": "smallest residual",
+                        "cautions": [],
+                    },
+                    "problem": None,
+                    "links": {
+                        "self": _SELF,
+                        "cancel": None,
+                        "result": f"{_SELF}/result.npz",
+                        "frames": f"{_SELF}/frames.zip",
+                        "frame": f"{_SELF}/frames/{{t}}.ply",
+                        "report": f"{_SELF}/report.json",
+                    },
+                }
+            ]
+        }
+    )
+
+    id: str
+    status: JobStatus
+    name: str | None = Field(description="Name of the measurement file.")
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    expires_at: datetime | None = Field(description="When a finished job and its files go.")
+    attempt: int = Field(description="How often a worker has started it.")
+    queue_position: int | None = Field(
+        description="Number of jobs before a queued one, in the document of one job."
+    )
+    cancel_requested: bool
+    options: dict[str, Any] = Field(description="All options in force.")
+    inputs: dict[str, InputFile] = Field(description="Files by part name.")
+    frames: int | None = Field(description="T, once it is known.")
+    points: int | None = Field(description="N, once it is known.")
+    progress: JobProgress | None
+    timings: dict[str, float] = Field(description="Seconds by stage, in the queue and in total.")
+    metrics: dict[str, Any] | None = Field(
+        description="Errors against the ground truth, where one was sent; `e3d` above all."
+    )
+    diagnostics: DiagnosticsSummary | None = Field(
+        description="Of a job that succeeded, in the document of one job."
+    )
+    problem: ProblemDocument | None = Field(description="Why a job failed.")
+    links: JobLinks
+
+
+class JobList(BaseModel):
+    """One page of jobs, newest first."""
+
+    jobs: list[Job]
+    next: str | None = Field(description="Path of the next page, as in the Link header (RFC 8288).")
+
+
+class Option(BaseModel):
+    """An option of a job."""
+
+    name: str
+    type: Literal["integer", "number", "boolean", "string"]
+    default: int | float | bool | str | None
+    help: str
+    minimum: float | None
+    maximum: float | None
+    choices: list[str] | None
+    nullable: bool
+
+
+class Limits(BaseModel):
+    """What the service accepts."""
+
+    upload_bytes: int = Field(description="All files of a job together.")
+    array_bytes: int = Field(description="An array, once decompressed.")
+    job_seconds: float = Field(description="Run time of a job.")
+    result_ttl_seconds: float = Field(description="How long finished jobs stay; 0 is for ever.")
+    wait_seconds: int = Field(description="Longest `Prefer: wait`.")
+    page_size: int = Field(description="Largest `limit` of a list.")
+
+
+class Formats(BaseModel):
+    """What goes in and what comes out."""
+
+    measurements: list[str]
+    ground_truth: list[str]
+    faces: list[str]
+    results: list[str]
+
+
+class Info(BaseModel):
+    """What this service is and can."""
+
+    version: str
+    limits: Limits
+    formats: Formats
+    options: list[Option]
+
+
+class Health(BaseModel):
+    """That the process lives."""
+
+    status: Literal["alive"] = "alive"
+
+
+class Readiness(BaseModel):
+    """That the service can take jobs."""
+
+    status: Literal["ready"] = "ready"
+    checks: dict[str, str] = Field(examples=[{"redis": "ok", "storage": "ok"}])
+    workers: int = Field(description="Live worker processes; with none, jobs wait.")
+    queued: int = Field(description="Jobs that wait for a worker.")
+
+
+class ProblemTypeDocument(BaseModel):
+    """Documentation of a problem type."""
+
+    type: str
+    title: str
+    status: int
+    meaning: str
+    remedy: str
+
+
+def job_document(
+    record: JobRecord,
+    *,
+    root: str,
+    position: int | None = None,
+    diagnostics: Mapping[str, Any] | None = None,
+) -> Job:
+    """Turn a job record into its document.
+
+    Parameters
+    ----------
+    record : JobRecord
+    root : str
+        Path prefix under which the service is reached, without a slash at its end.
+    position : int, optional
+        Number of jobs before this one.
+    diagnostics : mapping, optional
+        The diagnostics of report.json.
+    """
+    here = f"{root}/v1/jobs/{record.id}"
+    done = record.status == "succeeded"
+    active = record.status in ("queued", "running")
+    problem = None
+    if record.problem is not None:
+        problem = ProblemDocument(**{"instance": here, **record.problem})
+    return Job(
+        id=record.id,
+        status=record.status,
+        name=record.name,
+        created_at=_moment(record.created_at),
+        started_at=_moment_or_none(record.started_at),
+        finished_at=_moment_or_none(record.finished_at),
+        expires_at=_moment_or_none(record.expires_at),
+        attempt=record.attempt,
+        queue_position=position,
+        cancel_requested=record.cancel_requested,
+        options=dict(record.options),
+        inputs={
+            role: InputFile(
+                name=file.name,
+                bytes=file.bytes,
+                content_type=file.content_type,
+                sha256=file.sha256,
+            )
+            for role, file in record.inputs.items()
+        },
+        frames=record.frames,
+        points=record.points,
+        progress=JobProgress.model_validate(record.progress, from_attributes=True)
+        if record.progress is not None
+        else None,
+        timings=dict(record.timings),
+        metrics=dict(record.metrics) if record.metrics is not None else None,
+        diagnostics=DiagnosticsSummary.model_validate(diagnostics) if diagnostics else None,
+        problem=problem,
+        links=JobLinks(
+            self=here,
+            cancel=f"{here}/cancel" if active else None,
+            result=f"{here}/result.npz" if done else None,
+            frames=f"{here}/frames.zip" if done else None,
+            frame=f"{here}/frames/{{t}}.ply" if done else None,
+            report=f"{here}/report.json" if done else None,
+        ),
+    )
+
+
+def option_document(option: OptionDescription) -> Option:
+    """Turn the description of an option into its document."""
+    return Option.model_validate(option, from_attributes=True)
+
+
+def _moment(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _moment_or_none(seconds: float | None) -> datetime | None:
+    return None if seconds is None else _moment(seconds)

@@ -1,0 +1,392 @@
+"""Receiving a job: a multipart body streamed to the object storage (RFC 7578).
+
+No part is held in memory or in a temporary file. The first bytes of a file are looked at before
+any of them is stored, and whatever ends an upload early (a refusal, a client that goes away, a
+failing storage) leaves nothing behind. What a killed process leaves has no job record and is
+removed by `worker.maintenance`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import re
+from contextlib import aclosing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from anyio import CancelScope, to_thread
+from multipart import (
+    MultipartError,
+    MultipartSegment,
+    ParserLimitReached,
+    PushMultipartParser,
+    parse_options_header,
+)
+
+from service.problems import Problem
+from smsr.files import HEAD_BYTES, Beginning, check_prefix
+from smsr.measurements import check_shape
+from smsr.metrics import as_shapes
+from smsr.options import parse
+from worker.options import JobOptions
+from worker.records import InputFile, upload_key, upload_prefix
+from worker.storage import StorageError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator
+
+    from starlette.requests import Request
+
+    from smsr.files import Role
+    from worker.storage import ObjectStorage
+
+FILES: tuple[Role, ...] = ("measurements", "ground_truth", "faces")
+PARTS = (*FILES, "options")
+
+OPTIONS_BYTES = 64 * 1024
+FRAMING_BYTES = 64 * 1024
+"""What boundaries and part headers may add to the files and the options."""
+
+BLOCK_BYTES = 1 << 20
+"""How much is handed to the storage at once; packets are far smaller."""
+
+_NAME_LENGTH = 150
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class UploadLimits:
+    """What an upload may be.
+
+    Attributes
+    ----------
+    bytes : int
+        Of all files together.
+    array_bytes : int
+        Of each array, once decompressed.
+    idle_seconds : float
+        Silence after which an upload is given up.
+    """
+
+    bytes: int
+    array_bytes: int
+    idle_seconds: float = 60.0
+
+    @property
+    def body_bytes(self) -> int:
+        """Largest body: the files, the options and what separates them."""
+        return self.bytes + OPTIONS_BYTES + FRAMING_BYTES
+
+    def too_large(self) -> Problem:
+        """Return the refusal of more than this."""
+        return Problem(
+            "upload-too-large",
+            f"The files of a job may have {self.bytes} bytes ({self.bytes / 2**30:.3g} GiB) "
+            "together.",
+            limit=self.bytes,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """A job as it was uploaded.
+
+    Attributes
+    ----------
+    options : JobOptions
+    inputs : dict of str to InputFile
+        By part name; 'measurements' is among them.
+    frames, points : int or None
+        T and N, where the beginning of the measurements tells them.
+    """
+
+    options: JobOptions
+    inputs: dict[Role, InputFile]
+    frames: int | None
+    points: int | None
+
+
+async def receive_submission(
+    request: Request, job_id: str, storage: ObjectStorage, limits: UploadLimits
+) -> Submission:
+    """Read the body of a submission and store its files.
+
+    Parameters
+    ----------
+    request : Request
+        Its body is read here, once.
+    job_id : str
+        Names the objects.
+    storage : ObjectStorage
+    limits : UploadLimits
+
+    Raises
+    ------
+    Problem, smsr.errors.SmsrError
+        The submission is refused; nothing of it is left in the storage.
+    starlette.requests.ClientDisconnect
+        The client went away; nothing is left either.
+    """
+    boundary = _boundary(request)
+    announced = request.headers.get("content-length", "")
+    if announced.isdecimal() and int(announced) > limits.body_bytes:
+        raise limits.too_large()
+    upload = _Upload(request, boundary, job_id, storage, limits)
+    try:
+        return await upload.receive()
+    except BaseException:
+        # Shielded: a cancelled request cleans up as well.
+        with CancelScope(shield=True):
+            await discard_uploads(storage, job_id)
+        raise
+
+
+async def discard_uploads(storage: ObjectStorage, job_id: str) -> None:
+    """Remove the inputs of a job that will not be; where that fails, maintenance does it later."""
+    try:
+        await to_thread.run_sync(storage.delete_prefix, upload_prefix(job_id))
+    except StorageError:
+        _log.warning("the files of a refused upload could not be removed now", exc_info=True)
+
+
+class _Upload:
+    """One body on its way."""
+
+    def __init__(
+        self,
+        request: Request,
+        boundary: str,
+        job_id: str,
+        storage: ObjectStorage,
+        limits: UploadLimits,
+    ) -> None:
+        self._request = request
+        self._job_id = job_id
+        self._storage = storage
+        self._limits = limits
+        self._left = limits.bytes
+        self._options: JobOptions | None = None
+        self._inputs: dict[Role, InputFile] = {}
+        self._heads: dict[Role, bytes] = {}
+        try:
+            # Not strict: strict parsing refuses a line break behind the last boundary whenever it
+            # happens to arrive in a packet of its own.
+            self._parser = PushMultipartParser(boundary, max_segment_count=len(PARTS) + 1)
+        except MultipartError as error:
+            raise _malformed(error) from None
+
+    async def receive(self) -> Submission:
+        """Take the parts in the order in which they come."""
+        async with aclosing(self._events()) as events:
+            async for event in events:
+                # The body of a part is consumed below, so a part begins here.
+                part = cast("MultipartSegment", event)
+                role = self._role(part)
+                if role == "options":
+                    self._options = parse(JobOptions, await _read_options(_body(events)))
+                else:
+                    await self._store(cast("Role", role), part, _body(events))
+        if "measurements" not in self._inputs:
+            raise Problem(
+                "missing-measurements",
+                "The body has no part `measurements` with a file. "
+                + (f"It has {', '.join(self._inputs)}." if self._inputs else "It has no file."),
+            )
+        options = self._options or JobOptions()
+        return Submission(options, self._inputs, *self._check_together(options))
+
+    async def _events(self) -> AsyncGenerator[MultipartSegment | bytes | None, None]:
+        """Yield what the parser finds: a segment, its bytes, None at its end, and so on."""
+        chunks = self._request.stream()
+        received = 0
+        try:
+            while True:
+                try:
+                    async with asyncio.timeout(self._limits.idle_seconds):
+                        chunk = await anext(chunks)
+                except StopAsyncIteration:
+                    break
+                except TimeoutError:
+                    raise Problem(
+                        "upload-stalled",
+                        f"No byte arrived for {self._limits.idle_seconds:g} seconds.",
+                        headers={"Connection": "close"},
+                    ) from None
+                received += len(chunk)
+                if received > self._limits.body_bytes:
+                    raise self._limits.too_large()
+                if chunk:
+                    for event in self._parser.parse(chunk):
+                        yield event
+            self._parser.close()
+        except MultipartError as error:
+            raise _malformed(error) from None
+
+    def _role(self, segment: MultipartSegment) -> str:
+        """Return the name of a part, checked."""
+        name = segment.name or ""
+        if name not in PARTS:
+            shown = name if len(name) <= 60 else name[:57] + "..."
+            raise Problem(
+                "unknown-part",
+                f"There is no part {shown!r}. Parts are {', '.join(PARTS)}.",
+                part=shown,
+                parts=list(PARTS),
+            )
+        if name in self._inputs or (name == "options" and self._options is not None):
+            raise Problem("duplicate-part", f"The part {name!r} was sent twice.", part=name)
+        return name
+
+    async def _store(
+        self, role: Role, segment: MultipartSegment, body: AsyncIterator[bytes]
+    ) -> None:
+        """Check the beginning of a file and stream the file to the storage."""
+        name = safe_name(segment.filename, role)
+        chunks = self._checked(role, name, self._counted(body))
+        stored = await self._storage.put_stream(upload_key(self._job_id, role), chunks)
+        self._inputs[role] = InputFile(
+            key=stored.key,
+            name=name,
+            bytes=stored.bytes,
+            sha256=stored.sha256,
+            content_type=_content_type(segment),
+        )
+
+    async def _counted(self, body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+        """Pass a file on as long as all files together are within the limit."""
+        async for chunk in body:
+            self._left -= len(chunk)
+            if self._left < 0:
+                raise self._limits.too_large()
+            yield chunk
+
+    async def _checked(
+        self, role: Role, name: str, body: AsyncIterator[bytes]
+    ) -> AsyncIterator[bytes]:
+        """Hold a file back until its beginning has been looked at, then pass on large blocks."""
+        block = bytearray()
+        size = 0
+        enough = HEAD_BYTES
+        async for chunk in body:
+            block += chunk
+            if len(block) >= enough:
+                if role not in self._heads:
+                    self._heads[role] = bytes(block[:HEAD_BYTES])
+                    self._check(role, name, None)
+                    enough = BLOCK_BYTES
+                size += len(block)
+                yield bytes(block)
+                block = bytearray()
+        self._heads.setdefault(role, bytes(block))
+        self._check(role, name, size + len(block))
+        yield bytes(block)
+
+    def _check(self, role: Role, name: str, size: int | None) -> Beginning:
+        """Refuse a file by its first bytes, and by its size once that is known."""
+        return check_prefix(
+            self._heads[role],
+            size,
+            name,
+            role,
+            self._limits.array_bytes,
+            layout=self._options.layout if self._options else None,
+        )
+
+    def _check_together(self, options: JobOptions) -> tuple[int, int] | tuple[None, None]:
+        """Refuse files that do not fit each other or the options; return T and N where known."""
+        self._options = options  # the files may have come first, and be another layout's
+        found = {
+            role: self._check(role, file.name, file.bytes)
+            for role, file in self._inputs.items()
+            if role in self._heads
+        }
+        measurements = found["measurements"]
+        if measurements.shape is None or measurements.dtype is None:
+            return None, None
+        size = check_shape(measurements.shape, measurements.dtype, options.layout)
+        truth = found.get("ground_truth")
+        if truth is not None and truth.shape is not None and truth.dtype is not None:
+            # A broadcast zero has the shape without the memory.
+            as_shapes(np.broadcast_to(np.zeros((), truth.dtype), truth.shape), *size)
+        return size
+
+
+async def _body(
+    events: AsyncIterator[MultipartSegment | bytes | None],
+) -> AsyncIterator[bytes]:
+    """Yield the bytes of the part that has just begun."""
+    async for event in events:
+        if event is None:
+            return
+        yield cast("bytes", event)
+
+
+async def _read_options(body: AsyncIterator[bytes]) -> dict[str, Any]:
+    """Read the part with the options."""
+    text = bytearray()
+    async for chunk in body:
+        text += chunk
+        if len(text) > OPTIONS_BYTES:
+            raise Problem(
+                "malformed-options", f"The options are longer than {OPTIONS_BYTES} bytes."
+            )
+    try:
+        values = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
+    except RecursionError:
+        raise Problem("malformed-options", "The options are nested too deeply.") from None
+    except ValueError as error:
+        raise Problem("malformed-options", f"The options are no valid JSON: {error}.") from None
+    if not isinstance(values, dict):
+        raise Problem(
+            "malformed-options", f"The options are a JSON {_json_type(values)}, not an object."
+        )
+    return values
+
+
+def _no_constant(name: str) -> object:
+    raise ValueError(f"{name} is no JSON")
+
+
+def _json_type(value: object) -> str:
+    names = {list: "array", str: "string", bool: "boolean", type(None): "null"}
+    return names.get(type(value), "number")
+
+
+def _boundary(request: Request) -> str:
+    """Return the boundary of a multipart/form-data body."""
+    given = request.headers.get("content-type", "")
+    kind, parameters = parse_options_header(given)
+    if kind != "multipart/form-data":
+        raise Problem(
+            "unsupported-media-type",
+            f"A job is sent as multipart/form-data, not as {kind or 'a body of unknown type'}.",
+            headers={"Accept": "multipart/form-data"},
+        )
+    boundary: str = parameters.get("boundary", "")
+    if not boundary:
+        raise Problem("malformed-multipart", "The Content-Type names no boundary.")
+    return boundary
+
+
+def _malformed(error: MultipartError) -> Problem:
+    if isinstance(error, ParserLimitReached):
+        return Problem("malformed-multipart", f"The body has too many parts or headers: {error}.")
+    return Problem("malformed-multipart", f"The body is no valid multipart/form-data: {error}.")
+
+
+def safe_name(given: str | None, role: str) -> str:
+    """Return a file name for people: no folders, no control characters, not endless."""
+    name = re.split(r"[/\\]", given or "")[-1]
+    name = "".join(c for c in name if c.isprintable()).strip()
+    if len(name) > _NAME_LENGTH:  # keep the suffix, it tells the format
+        name = name[: _NAME_LENGTH - 20] + name[-20:]
+    return name or role
+
+
+def _content_type(segment: MultipartSegment) -> str | None:
+    kind = segment.content_type or ""
+    return kind if re.fullmatch(r"[\w.+-]{1,60}/[\w.+-]{1,60}", kind) else None

@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+import smsr
+from tests.service.conftest import ARRAY_LIMIT, UPLOAD_LIMIT, Api
+from worker.options import JobOptions
+
+if TYPE_CHECKING:
+    import httpx
+
+
+def test_info_tells_version_limits_formats_and_options(client: httpx.Client) -> None:
+    info = client.get("/v1/info").json()
+    assert info["version"] == smsr.__version__
+    assert info["limits"]["upload_bytes"] == UPLOAD_LIMIT
+    assert info["limits"]["array_bytes"] == ARRAY_LIMIT
+    assert {"npy", "npz", "mat", "csv"} <= set(info["formats"]["measurements"])
+    options = {option["name"]: option for option in info["options"]}
+    assert set(options) == {option.name for option in fields(JobOptions)}
+    layout = options["layout"]
+    assert layout["type"] == "string"
+    assert layout["default"] in layout["choices"]
+    assert options["time_limit"]["nullable"]
+    assert options["time_limit"]["minimum"] == 1
+
+
+def test_alive_and_ready(client: httpx.Client, idle_api: Api) -> None:
+    assert client.get("/healthz").json() == {"status": "alive"}
+    ready = client.get("/readyz").json()
+    assert ready["status"] == "ready"
+    assert ready["checks"] == {"redis": "ok", "storage": "ok"}
+    assert ready["workers"] == 1
+    with idle_api.client() as idle:
+        assert idle.get("/readyz").json()["workers"] == 0
+    assert client.get("/healthz").headers["x-content-type-options"] == "nosniff"
