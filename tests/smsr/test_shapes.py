@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from smsr import rotations as so3
+from smsr.shapes import (
+    DepthProblem,
+    basis_size_of,
+    low_rank_shapes,
+    minimise_reweighted,
+    planar_shapes,
+    published_shapes,
+    reweighted_shapes,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+cp: Any = pytest.importorskip("cvxpy")
+
+
+def sequence(
+    frames: int = 40, points: int = 20, modes: int = 1, seed: int = 0
+) -> tuple[Array, Array, Array]:
+    """Return W (2T, N) of unit spectral norm, rotations and the true shapes (T, 3, N)."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 1.0, frames)[:, None]
+    weights = 0.2 * np.sin(2 * np.pi * (time * rng.uniform(1, 3, modes) + rng.random(modes)))
+    basis = rng.standard_normal((modes + 1, 3, points))
+    shapes = basis[0] + np.tensordot(weights, basis[1:], axes=1)
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    rotations = so3.exp(np.linspace(0.0, 5.0, frames)[:, None] * np.array([0.1, 1.0, 0.2]))
+    W = (rotations[:, :2] @ shapes).reshape(2 * frames, points)
+    scale = np.linalg.norm(W, 2)
+    return W / scale, rotations, shapes / scale
+
+
+def nuclear_norm(shapes: Array) -> float:
+    rows = shapes.reshape(len(shapes), -1)
+    return float(np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False).sum())
+
+
+def relative_error(found: Array, true: Array) -> float:
+    return float(np.linalg.norm(found - true) / np.linalg.norm(true))
+
+
+METHODS = [low_rank_shapes, reweighted_shapes, published_shapes]
+
+
+@pytest.mark.parametrize("method", METHODS)
+class TestEveryMethod:
+    def test_measurements_are_reproduced(self, method: Callable[..., Any]) -> None:
+        W, rotations, _ = sequence()
+        found = method(W, rotations)
+        assert found.converged
+        assert found.iterations == len(found.residuals)
+        np.testing.assert_allclose(
+            (rotations[:, :2] @ found.shapes).reshape(W.shape), W, atol=1e-12
+        )
+
+    def test_shapes_are_found_from_true_cameras(self, method: Callable[..., Any]) -> None:
+        W, rotations, shapes = sequence()
+        assert relative_error(method(W, rotations, tolerance=1e-6).shapes, shapes) < 0.1
+
+    def test_rigid_shape_is_found(self, method: Callable[..., Any]) -> None:
+        W, rotations, shapes = sequence(modes=0)
+        assert relative_error(method(W, rotations, tolerance=1e-6).shapes, shapes) < 1e-3
+
+    def test_turning_all_points_or_mixing_them_commutes(self, method: Callable[..., Any]) -> None:
+        W, rotations, _ = sequence()
+        mix = np.linalg.qr(np.random.default_rng(0).standard_normal((20, 20)))[0]
+        plain, mixed = method(W, rotations).shapes, method(W @ mix, rotations).shapes
+        np.testing.assert_allclose(mixed, plain @ mix, atol=1e-8)
+
+    def test_another_object_frame_turns_the_shapes(self, method: Callable[..., Any]) -> None:
+        W, rotations, _ = sequence()
+        Q = so3.exp(np.array([[0.3, -1.0, 0.4]]))[0]
+        plain, turned = method(W, rotations).shapes, method(W, rotations @ Q.T).shapes
+        np.testing.assert_allclose(turned, Q @ plain, atol=1e-8)
+
+    def test_it_stops_at_the_limit_and_says_so(self, method: Callable[..., Any]) -> None:
+        W, rotations, _ = sequence()
+        found = method(W, rotations, max_iterations=3, tolerance=1e-15)
+        assert not found.converged
+        assert found.iterations == 3
+        assert np.isfinite(found.shapes).all()
+
+    def test_progress_grows_to_at_most_one(self, method: Callable[..., Any]) -> None:
+        W, rotations, _ = sequence()
+        seen: list[float] = []
+        method(W, rotations, hook=lambda fraction, *_: seen.append(fraction))
+        assert seen == sorted(seen)
+        assert 0.0 < seen[0] <= seen[-1] <= 1.0
+
+
+def test_planar_shapes_have_no_depth() -> None:
+    W, rotations, _ = sequence()
+    planar = planar_shapes(W, rotations)
+    seen = rotations @ planar
+    np.testing.assert_allclose(seen[:, 2], 0.0, atol=1e-14)
+    np.testing.assert_allclose(seen[:, :2].reshape(W.shape), W, atol=1e-14)
+
+
+class TestConvergedMinimum:
+    def test_it_is_the_minimum_of_the_nuclear_norm(self) -> None:
+        W, rotations, _ = sequence(frames=6, points=4, modes=2)
+        found = low_rank_shapes(W, rotations, tolerance=1e-9, max_iterations=20_000)
+        rows = [cp.Variable((3, 4)) for _ in range(6)]
+        S = cp.vstack([cp.reshape(row, (1, 12), order="C") for row in rows])
+        centred = S - np.full((6, 6), 1 / 6) @ S
+        constraints = [rotations[t, :2] @ rows[t] == W[2 * t : 2 * t + 2] for t in range(len(rows))]
+        oracle = cp.Problem(cp.Minimize(cp.normNuc(centred)), constraints)
+        oracle.solve(solver=cp.SCS, eps=1e-8, max_iters=50_000)
+        assert nuclear_norm(found.shapes) == pytest.approx(oracle.value, rel=1e-5)
+        assert nuclear_norm(found.shapes) <= nuclear_norm(planar_shapes(W, rotations))
+
+    @pytest.mark.parametrize("scale", [1e-3, 1e4])
+    def test_units_do_not_matter(self, scale: float) -> None:
+        W, rotations, _ = sequence()
+        plain = low_rank_shapes(W, rotations)
+        scaled = low_rank_shapes(scale * W, rotations)
+        assert scaled.iterations == plain.iterations
+        np.testing.assert_allclose(
+            scaled.shapes, scale * plain.shapes, rtol=1e-9, atol=1e-9 * scale
+        )
+
+
+class TestPublishedSchedule:
+    def test_residual_falls(self) -> None:
+        W, rotations, _ = sequence()
+        residuals = np.array(published_shapes(W, rotations, tolerance=1e-7).residuals)
+        assert residuals[-1] < 1e-7
+        # The constraint is met more and more closely once the multipliers have built up.
+        late = residuals[residuals.argmax() :]
+        assert late[::20][-1] < 1e-3 * late[0]
+
+    def test_slow_growth_reaches_the_minimum(self) -> None:
+        W, rotations, _ = sequence()
+        best = nuclear_norm(low_rank_shapes(W, rotations, tolerance=1e-8).shapes)
+        slow = nuclear_norm(published_shapes(W, rotations).shapes)
+        hasty = nuclear_norm(published_shapes(W, rotations, penalty_growth=3.0).shapes)
+        assert slow == pytest.approx(best, rel=1e-2)
+        assert hasty > 1.05 * best
+
+
+class TestReweighted:
+    def test_it_lowers_the_rank_more_than_the_nuclear_norm(self) -> None:
+        W, rotations, shapes = sequence(modes=2)
+        plain = low_rank_shapes(W, rotations).shapes
+        reweighted = reweighted_shapes(W, rotations).shapes
+        assert relative_error(reweighted, shapes) < relative_error(plain, shapes)
+
+    def test_least_motion_start_moves_less_than_any_other(self) -> None:
+        W, rotations, _ = sequence()
+        problem = DepthProblem(W, rotations)
+        problem.start_from_least_motion()
+        least = problem.motion()
+        rng = np.random.default_rng(0)
+        axis = rotations[:, 2][:, :, None]
+        best = problem.shapes.reshape(40, 3, -1)
+        for size in (1e-4, 1e-2, 1.0):
+            other = best + size * axis * rng.standard_normal((40, 1, 20))
+            assert (np.diff(other, axis=0) ** 2).sum() > least
+
+    @pytest.mark.parametrize("motion_weight", [0.0, 0.5])
+    def test_camera_gradient_is_that_of_the_minimum(self, motion_weight: float) -> None:
+        W, rotations, _ = sequence(frames=8, points=6, modes=2)
+        rng = np.random.default_rng(0)
+        rotations = so3.exp(0.05 * rng.standard_normal((8, 3))) @ rotations
+
+        def minimum(turns: Array) -> DepthProblem:
+            problem = DepthProblem(W, so3.exp(turns) @ rotations)
+            problem.start_from_least_motion()
+            problem.motion_weight = motion_weight
+            assert problem.minimise(20_000, 1e-11)
+            return problem
+
+        gradient = minimum(np.zeros((8, 3))).camera_gradient()
+        for _ in range(3):
+            d = rng.standard_normal((8, 3))
+            slope = (minimum(1e-4 * d).value() - minimum(-1e-4 * d).value()) / 2e-4
+            assert (gradient * d).sum() == pytest.approx(slope, rel=1e-3)
+
+    def test_turning_keeps_what_each_camera_sees(self) -> None:
+        W, rotations, _ = sequence()
+        problem = DepthProblem(W, rotations)
+        problem.start_from_least_motion()
+        problem.minimise(20, 1e-9)
+        before = rotations @ problem.shapes.reshape(40, 3, -1)
+        turned = so3.exp(np.full((40, 3), 0.02)) @ rotations
+        problem.turn_to(turned)
+        np.testing.assert_allclose(turned @ problem.shapes.reshape(40, 3, -1), before, atol=1e-12)
+
+    def test_rounds_share_the_iterations(self) -> None:
+        W, rotations, _ = sequence()
+        problem = DepthProblem(W, rotations)
+        problem.start_from_least_motion()
+        minimise_reweighted(
+            problem, motion_weight=1.5, rounds=6, max_iterations=50, tolerance=1e-12
+        )
+        assert len(problem.residuals) == 50
+
+
+@pytest.mark.parametrize("modes", [0, 1, 3])
+def test_basis_size_counts_the_basis_shapes(modes: int) -> None:
+    _, _, shapes = sequence(modes=modes)
+    assert basis_size_of(shapes) == modes + 1
