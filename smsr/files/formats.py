@@ -15,6 +15,7 @@ READABLE = "NumPy .npy and .npz, MATLAB .mat, .csv, .txt, .csv.gz and .txt.gz"
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _GZIP = b"\x1f\x8b"
 _TEXT_SUFFIXES = frozenset({".csv", ".txt", ".tsv", ".dat"})
+_BINARY_SUFFIXES = frozenset({".npy", ".npz", ".h5", ".hdf5"})
 _TEXT_BYTES = frozenset(bytes(range(32, 127)) + b"\t\n\r")
 _FOREIGN = {
     b"\x80\x03": "a Python pickle, which is never read because it can run code",
@@ -79,7 +80,8 @@ def sniff(head: bytes, name: str) -> FileFormat:
     for magic, what in _FOREIGN.items():
         if head.startswith(magic):
             raise UnsupportedFormat(f"{name} is {what}. Readable are {READABLE}.")
-    if _is_text(head):
+    # MATLAB writes text under .mat with "save -ascii"; the others never hold text.
+    if _is_text(head) and PurePath(name).suffix.lower() not in _BINARY_SUFFIXES:
         return FileFormat.TEXT
     raise UnsupportedFormat(f"{name} is in no format that is read here: {READABLE}.{_hint(name)}")
 
@@ -90,7 +92,7 @@ def _is_text(head: bytes) -> bool:
 
 def _hint(name: str) -> str:
     match PurePath(name).suffix.lower():
-        case ".npy" | ".npz" as suffix:
+        case suffix if suffix in _BINARY_SUFFIXES:
             return f" Its name ends in {suffix}, but it does not begin like such a file."
         case ".mat":
             return " If it is a MATLAB file of version 4, save it again with -v7 or -v7.3."

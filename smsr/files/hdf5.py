@@ -71,9 +71,10 @@ class _Reader:
     def answer(self) -> dict[str, Any]:
         """Return the next message."""
         line = self._answers.readline(_LONGEST_LINE)
-        if not line.endswith(b"\n"):
-            raise UnreadableFile("The HDF5 file is damaged: reading it fails.")
-        message: dict[str, Any] = json.loads(line)
+        try:
+            message: dict[str, Any] = json.loads(line)
+        except ValueError:  # the process died
+            raise _failed() from None
         if "error" in message:
             raise UnreadableFile(f"The HDF5 file cannot be read: {message['error'][:300]}.")
         return message
@@ -124,16 +125,20 @@ class _Reader:
             self._requests.write(json.dumps(request).encode() + b"\n")
             self._requests.flush()
         except BrokenPipeError:
-            raise UnreadableFile("The HDF5 file is damaged: reading it fails.") from None
+            raise _failed() from None
 
     def _fill(self, target: NDArray[np.uint8]) -> None:
         filled = 0
         while filled < len(target):
             data = self._answers.read(min(2**20, len(target) - filled))
             if not data:
-                raise UnreadableFile("The HDF5 file is damaged: reading it fails.")
+                raise _failed()
             target[filled : filled + len(data)] = np.frombuffer(data, np.uint8)
             filled += len(data)
+
+
+def _failed() -> UnreadableFile:
+    return UnreadableFile("The HDF5 file is damaged: reading it fails.")
 
 
 def _blocks(

@@ -144,7 +144,7 @@ def _find(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Stored
     try:
         with archive.open(info) as member:
             header = parse_header(_read_up_to(member, HEADER_BYTES))
-        _check_member(info, header)
+        _check_member(info, header, path.stat().st_size)
     except (zipfile.BadZipFile, *_FAILURES) as error:
         return unusable(_damaged(error))
 
@@ -156,9 +156,11 @@ def _find(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Stored
     return StoredArray(name, header.shape, header.dtype, read, header.problem)
 
 
-def _check_member(info: zipfile.ZipInfo, header: NpyHeader) -> None:
+def _check_member(info: zipfile.ZipInfo, header: NpyHeader, file_size: int) -> None:
     if header.dtype is None:
         return
+    if info.header_offset + info.compress_size > file_size:
+        raise UnreadableFile(f"The member {info.filename} of the .npz goes past its end.")
     expected = header.offset + header.nbytes
     stored = info.compress_type == zipfile.ZIP_STORED
     possible = info.compress_size * (1 if stored else _MOST_EXPANSION)

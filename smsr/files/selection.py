@@ -128,6 +128,8 @@ def check_chosen(array: StoredArray, limit: int) -> None:
     """Refuse an array that cannot be used or would be larger than `limit` bytes."""
     if array.problem is not None:
         raise array.problem
+    if not array.shape:
+        raise WrongShape(f"The array{_quoted(array.name)} is a single number.", shape=[])
     if 0 in array.shape:
         raise WrongShape(
             f"The array{_quoted(array.name)} is empty: its shape is {array.shape}.",
@@ -159,8 +161,9 @@ def _by_key(stored: list[StoredArray], key: str) -> StoredArray:
             key=key,
             arrays=[],
         )
-    near = difflib.get_close_matches(key, [array.name for array in named], n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    names = {array.name.lower(): array.name for array in named}
+    near = difflib.get_close_matches(key.lower(), names, n=1)
+    hint = f" Did you mean {names[near[0]]!r}?" if near else ""
     raise ArrayNotFound(
         f"The file holds no array {key!r}.{hint} It holds {_listed(named) or 'none'}.",
         key=key,

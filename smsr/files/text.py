@@ -33,7 +33,7 @@ _BLOCK = 2**22
 _ITEMSIZE = 8
 
 _MOST_EXPANSION = 100
-_TRUSTED = 4 * 2**20
+_TRUSTED = 2**20
 """Numbers in text do not compress a hundredfold; more than that, past the first bytes, is a
 decompression bomb."""
 

@@ -151,13 +151,13 @@ def test_scale_is_charged() -> None:
 @pytest.mark.parametrize("form", ["rows", "points last", "float32", "fortran"])
 def test_every_layout_of_the_truth_is_read(form: str) -> None:
     truth = EXAMPLE.ground_truth
-    given_truth = {
+    forms: dict[str, NDArray[Any]] = {
         "rows": truth.transpose(0, 2, 1).reshape(36, 20),
         "points last": truth.transpose(0, 2, 1),
         "float32": truth.astype(np.float32),
         "fortran": np.asfortranarray(truth.transpose(0, 2, 1).reshape(36, 20)),
-    }[form]
-    assert evaluate(given_truth, perfect(EXAMPLE)).e3d < (1e-6 if form == "float32" else 1e-12)
+    }
+    assert evaluate(forms[form], perfect(EXAMPLE)).e3d < (1e-6 if form == "float32" else 1e-12)
 
 
 def test_blocks_of_points_give_what_one_block_gives(monkeypatch: pytest.MonkeyPatch) -> None:
