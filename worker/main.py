@@ -100,7 +100,8 @@ def _prepare_for_forks(threads: int) -> None:
     """Load what work-horses need, once: a fork then takes milliseconds and shares the memory."""
     for variable in _THREAD_VARIABLES:
         os.environ[variable] = str(threads)
-    importlib.import_module("worker.task")
+    for module in ("worker.task", "smsr.pipeline"):
+        importlib.import_module(module)
     gc.collect()
     gc.freeze()
 

@@ -25,6 +25,8 @@ from smsr.synthetic import make_example
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from smsr.metrics import Frame
+
 MEBIBYTE = 1 << 20
 
 
@@ -76,7 +78,8 @@ def test_a_set_in_a_file_of_ones_own_is_measured_in_both_frames(
     assert list(measured.e3d) == ["camera", "object"]
     with np.load(own_set) as arrays:
         result = smsr.reconstruct(arrays["W"])
-        for frame, key in (("camera", "S"), ("object", "S_world")):
+        truths: dict[Frame, str] = {"camera": "S", "object": "S_world"}
+        for frame, key in truths.items():
             expected = smsr.evaluate(arrays[key], result, frame=frame)
             assert measured.e3d[frame] == pytest.approx(expected.e3d, rel=1e-3)
             assert measured.e3d_per_frame[frame] <= measured.e3d[frame]
