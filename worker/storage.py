@@ -381,9 +381,12 @@ class _Meter:
                 self.bytes += len(chunk)
                 if self.limit is not None and self.bytes > self.limit:
                     raise UploadTooLarge(self.limit)
-                self.sha256.update(chunk)
                 if chunk:
-                    yield bytes(chunk)
+                    # Hashed beside the loop, while the storage writes and the next bytes arrive.
+                    block = bytes(chunk)
+                    hashing = asyncio.create_task(asyncio.to_thread(self.sha256.update, block))
+                    yield block
+                    await hashing
         except OSError as error:
             self.broken = error
             raise
