@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def errors_of(module: ModuleType) -> Iterator[type[errors.SmsrError]]:
     for error in vars(module).values():
-        if inspect.isclass(error) and errors.SmsrError in error.__mro__[1:]:
+        if inspect.isclass(error) and issubclass(error, errors.SmsrError):
             yield error
 
 
