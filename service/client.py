@@ -18,6 +18,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final, Self, TypeAlias, cast
+from urllib.parse import urlsplit
 
 import httpx
 
@@ -146,6 +147,8 @@ class Client:
         self._http = httpx.Client(
             base_url=self.server,
             transport=transport,
+            # A proxy of the environment cannot reach this machine's loopback interface.
+            mounts=dict.fromkeys(("all://127.0.0.1", "all://localhost", "all://[::1]")),
             timeout=httpx.Timeout(10.0, read=120.0, write=120.0),
             headers={"Accept": "application/json, application/problem+json"},
         )
@@ -286,11 +289,12 @@ class Client:
         status : str, optional
             Only jobs of this status.
         """
-        page: str | None = "/v1/jobs" + (f"?status={status}" if status else "")
-        while page is not None:
-            found = JobList.model_validate(self._request("GET", page).json())
+        query: str | None = f"status={status}" if status else ""
+        while query is not None:
+            found = JobList.model_validate(self._request("GET", f"/v1/jobs?{query}").json())
             yield from found.jobs
-            page = found.next
+            # A path, perhaps with the prefix of a proxy that stands in our address already.
+            query = None if found.next is None else urlsplit(found.next).query
 
     def cancel(self, job_id: str) -> Job:
         """Cancel a queued or running job; a running one stops within seconds."""

@@ -144,6 +144,7 @@ class _Moody(ThreadingHTTPServer):
 
     def __init__(self) -> None:
         self.bodies: list[bytes] = []
+        self.paths: list[str] = []
         self.answers: list[Callable[[BaseHTTPRequestHandler], None]] = []
         super().__init__(("127.0.0.1", 0), _Handler)
 
@@ -152,6 +153,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Moody
 
     def do_GET(self) -> None:
+        self.server.paths.append(self.path)
         if self.server.answers:
             self.server.answers.pop(0)(self)
         else:
@@ -217,6 +219,29 @@ def test_an_upload_is_sent_whole_again(moody: _Moody, tmp_path: Path, finished: 
         assert client.submit(tmp_path / "tracks.npy").id == finished.id
     content = (tmp_path / "tracks.npy").read_bytes()
     assert [content in body for body in moody.bodies] == [True, True]
+
+
+def test_a_list_goes_on_over_pages_below_a_prefix(moody: _Moody, finished: Job) -> None:
+    job = finished.model_dump(mode="json")
+    moody.answers = [
+        lambda handler: answer(
+            handler, 200, {"jobs": [job], "next": "/prefix/v1/jobs?status=succeeded&cursor=a%2Bb"}
+        ),
+        lambda handler: answer(handler, 200, {"jobs": [job, job], "next": None}),
+    ]
+    with Client(f"http://127.0.0.1:{moody.server_address[1]}/prefix/") as client:
+        assert len(list(client.list(status="succeeded"))) == 3
+    assert moody.paths == [
+        "/prefix/v1/jobs?status=succeeded",
+        "/prefix/v1/jobs?status=succeeded&cursor=a%2Bb",
+    ]
+
+
+def test_loopback_needs_no_proxy(moody: _Moody, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    with _client(moody, patience=0) as client:
+        assert list(client.list()) == []
 
 
 def test_patience_ends(moody: _Moody) -> None:
