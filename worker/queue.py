@@ -42,6 +42,9 @@ TASK = "worker.task.run"
 TICKET_TTL = 60
 """Seconds for which RQ remembers a ticket whose work-horse died."""
 
+FORMER_TICKET_TTL = 600
+"""Seconds for which a ticket that was replaced may still lead a worker to its job."""
+
 _LATE_WRITER_SECONDS = 15.0
 """After a deletion a worker that has not noticed may write for a while; look again after that."""
 
@@ -200,7 +203,8 @@ class JobQueue:
             at_front=first,
         )
         if former:
-            self.discard_ticket(former)
+            # Some worker may still be about to begin with it, so it is left to fade away.
+            self.redis.expire(Job.key_for(former), FORMER_TICKET_TTL)
 
     def discard_ticket(self, ticket: str) -> None:
         """Remove all that RQ knows of a ticket."""
@@ -235,7 +239,7 @@ class JobQueue:
             self.enqueue(job_id, first=True)
         unticketed: Sequence[str] = ()
         if self.redis.set(
-            f"{PREFIX}:looking", 1, nx=True, px=int(settings.lost_ticket_seconds * 500)
+            f"{PREFIX}:looking", 1, nx=True, px=int(settings.lost_ticket_seconds * 250)
         ):
             unticketed = self.records.without_ticket(settings.lost_ticket_seconds, [self.rq.key])
             for job_id in unticketed:

@@ -524,9 +524,9 @@ class RecordStore:
         texts = [part.decode() for part in flat]
         return dict(zip(texts[::2], texts[1::2], strict=True))
 
-    def without_ticket(self, age: float, lists: Sequence[str]) -> Sequence[str]:
-        """Return queued jobs, older than `age` seconds, whose ticket is in none of the RQ lists."""
-        return [job_id.decode() for job_id in self._step("unticketed", "*", age, *lists)]
+    def without_ticket(self, grace: float, lists: Sequence[str]) -> Sequence[str]:
+        """Return queued jobs whose ticket is in none of the RQ lists, for `grace` seconds now."""
+        return [job_id.decode() for job_id in self._step("unticketed", "*", grace, *lists)]
 
 
 def decode(job_id: str, found: Mapping[bytes, bytes]) -> JobRecord | None:

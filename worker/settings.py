@@ -100,7 +100,7 @@ class Settings(BaseSettings):
         default=1, gt=0, description="Time between two looks for lost and expired jobs."
     )
     lost_ticket_seconds: float = Field(
-        default=5, gt=0, description="Age of a queued job without a place in RQ to be queued again."
+        default=4, gt=0, description="Time a queued job may be without a place in RQ."
     )
 
     log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR|CRITICAL)$")

@@ -97,7 +97,6 @@ local function take_back(job, counts, max_attempts, problem, ttl)
   end
   redis.call('ZREM', leases, job)
   redis.call('HDEL', key, 'worker', 'suspected_at', 'progress')
-  redis.call('HSET', key, 'enqueued_at', stamp(now))
   set_status(job, 'queued')
   changed(job)
   return 'queued'
@@ -132,7 +131,7 @@ function steps.create(owner, nonce, ...)
     return known == nonce and 'ok' or 'exists'
   end
   redis.call('HSET', record, 'status', 'queued', 'created_at', stamp(now), 'owner', owner,
-    'nonce', nonce, 'enqueued_at', stamp(now), 'attempt', 0, 'lost_attempts', 0, ...)
+    'nonce', nonce, 'attempt', 0, 'lost_attempts', 0, ...)
   for _, status in ipairs({ '', ':queued' }) do
     for _, index in ipairs(indices(owner, status)) do
       redis.call('ZADD', index, stamp(now), id)
@@ -148,7 +147,8 @@ function steps.ticket(ticket)
     return nil
   end
   local former = read(record, 'ticket') or ''
-  redis.call('HSET', record, 'ticket', ticket, 'enqueued_at', stamp(now))
+  redis.call('HSET', record, 'ticket', ticket)
+  redis.call('HDEL', record, 'missing_since')
   return former == ticket and '' or former
 end
 
@@ -168,7 +168,7 @@ function steps.begin(worker, ticket, lease)
     return { 'finished' }
   end
   local attempt = redis.call('HINCRBY', record, 'attempt', 1)
-  redis.call('HDEL', record, 'progress', 'suspected_at')
+  redis.call('HDEL', record, 'progress', 'suspected_at', 'missing_since')
   redis.call('HSET', record, 'worker', worker, 'held_by', ticket, 'started_at', stamp(now))
   redis.call('ZADD', leases, stamp(now + lease), id)
   set_status(id, 'running')
@@ -285,8 +285,9 @@ function steps.expire(grace, max_attempts, problem, ttl)
   return outcome
 end
 
--- id is '*'; age in seconds, then the lists of tickets -> ids that are queued without a ticket
-function steps.unticketed(age, ...)
+-- id is '*'; grace seconds, then the lists of tickets -> ids that are queued without a ticket
+-- A ticket that is in no list may be on its way: it is missed at a later look only.
+function steps.unticketed(grace, ...)
   local present, missing = {}, {}
   for _, list in ipairs({ ... }) do
     for _, ticket in ipairs(redis.call('LRANGE', list, 0, -1)) do
@@ -294,8 +295,15 @@ function steps.unticketed(age, ...)
     end
   end
   for _, job in ipairs(redis.call('ZRANGE', prefix .. 'jobs:queued', 0, -1)) do
-    local fields = redis.call('HMGET', prefix .. 'job:' .. job, 'ticket', 'enqueued_at')
-    if not (fields[1] and present[fields[1]]) and now - (fields[2] or 0) >= tonumber(age) then
+    local key = prefix .. 'job:' .. job
+    local ticket, since = unpack(redis.call('HMGET', key, 'ticket', 'missing_since'))
+    if ticket and present[ticket] then
+      if since then
+        redis.call('HDEL', key, 'missing_since')
+      end
+    elseif not since then
+      redis.call('HSET', key, 'missing_since', stamp(now))
+    elseif now - since >= tonumber(grace) then
       missing[#missing + 1] = job
     end
   end
@@ -331,7 +339,7 @@ function steps.retry()
   discard_results(id, 1, tonumber(read(record, 'attempt')))
   redis.call('HDEL', record, 'problem', 'metrics', 'timings', 'result_prefix', 'progress',
     'started_at', 'finished_at', 'expires_at')
-  redis.call('HSET', record, 'lost_attempts', 0, 'enqueued_at', stamp(now))
+  redis.call('HSET', record, 'lost_attempts', 0)
   redis.call('ZREM', expiry, id)
   set_status(id, 'queued')
   changed(id)

@@ -157,6 +157,15 @@ class Workers:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(victim, signal.SIGKILL)
 
+    def stop(self) -> None:
+        for process in self.processes:
+            process.terminate()
+        for process in self.processes:
+            process.join(10)
+            if process.is_alive():
+                process.kill()
+                process.join()
+
 
 @pytest.fixture
 def start_worker(settings: Settings) -> Iterator[Workers]:
@@ -164,10 +173,4 @@ def start_worker(settings: Settings) -> Iterator[Workers]:
     try:
         yield started
     finally:
-        for process in started.processes:
-            process.terminate()
-        for process in started.processes:
-            process.join(10)
-            if process.is_alive():
-                process.kill()
-                process.join()
+        started.stop()

@@ -321,8 +321,13 @@ def test_queued_jobs_without_a_ticket_are_found(store: RecordStore) -> None:
     store.assign_ticket(with_ticket, "x")
     store.redis.rpush("tickets", "x")
     begun(store, started)
-    assert store.without_ticket(0, ["tickets"]) == [without]
+    assert store.without_ticket(0, ["tickets"]) == []
     assert store.without_ticket(60, ["tickets"]) == []
+    assert store.without_ticket(0, ["tickets"]) == [without]
+    store.assign_ticket(without, "y")  # on its way to the list
+    assert store.without_ticket(0, ["tickets"]) == []
+    store.redis.rpush("tickets", "y")
+    assert store.without_ticket(0, ["tickets"]) == []
 
 
 def test_listing_newest_first_in_stable_pages(store: RecordStore) -> None:
