@@ -18,8 +18,8 @@ from rq import get_current_job
 from threadpoolctl import threadpool_limits
 
 import smsr
-from smsr.errors import Cancelled, InvalidFaces, SmsrError
-from smsr.files import open_array
+from smsr.errors import Cancelled, SmsrError
+from smsr.files import load_faces, open_array
 from smsr.measurements import as_source
 from smsr.metrics import as_shapes
 from smsr.options import parse
@@ -187,7 +187,13 @@ class _Attempt:
             truth = self._open("ground_truth", self.options.ground_truth_key)
             as_shapes(truth, source.frames, source.points)
         if "faces" in self.record.inputs:
-            faces = _checked_faces(self._open("faces", self.options.faces_key), source.points)
+            faces = load_faces(
+                self._local("faces"),
+                source.points,
+                key=self.options.faces_key,
+                limit=self.settings.max_array_bytes,
+                name=self.record.inputs["faces"].name,
+            )
         self.timings["opening"] = time.perf_counter() - started
         return source, truth, faces
 
@@ -322,11 +328,3 @@ def _persist(action: Callable[[], T], errors: type[Exception], seconds: float) -
 
 def _queued_seconds(record: JobRecord) -> float:
     return max(0.0, (record.started_at or record.created_at) - record.created_at)
-
-
-def _checked_faces(faces: NDArray[Any], points: int) -> NDArray[Any]:
-    if faces.ndim != 2 or faces.shape[1] != 3:
-        raise InvalidFaces(f"Faces are an (F, 3) array; this one is {faces.shape}.")
-    if faces.size and (faces.min() < 0 or faces.max() >= points):
-        raise InvalidFaces(f"Faces are indices of points, 0 to {points - 1}.")
-    return faces.astype(np.int32)
