@@ -173,8 +173,9 @@ def test_the_process_ends_with_the_exit_status(tmp_path: Path) -> None:
 
 def test_an_interrupt_ends_a_run_without_a_trace(tmp_path: Path) -> None:
     write_example(tmp_path, frames=60, side=60)
+    never = ("-O", "shape_tolerance=1e-15", "-O", "shape_iterations=100000")
     with subprocess.Popen(
-        [sys.executable, "-m", "service.cli", "reconstruct", "measurements.npy"],
+        [sys.executable, "-m", "service.cli", "reconstruct", "measurements.npy", *never],
         cwd=tmp_path,
         env=clean_environment(),
         stdout=subprocess.PIPE,
