@@ -9,7 +9,6 @@ import json
 import os
 import signal
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from tests.conftest import redis_running
 from tests.worker.conftest import (
     Submitter,
     Workers,
+    alive,
     eventually,
     horses,
     quick_settings,
@@ -33,6 +33,8 @@ from worker.queue import JobQueue
 from worker.records import result_prefix
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from smsr.synthetic import Example
     from worker.records import JobRecord
     from worker.settings import Settings
@@ -218,16 +220,6 @@ def test_another_worker_takes_over_from_a_killed_one(
     # The scratch of the dead worker is removed by the next one that starts.
     start_worker.start()
     check_scratch_of(start_worker.settings, 2)
-
-
-def alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    with contextlib.suppress(OSError):
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return False
 
 
 def check_scratch_of(settings: Settings, workers: int) -> None:
