@@ -8,6 +8,8 @@ from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
 from anyio import to_thread
+from fastapi import APIRouter
+from fastapi.routing import APIRoute
 from fastapi_offline import FastAPIOffline
 
 import smsr
@@ -96,9 +98,21 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     for routes in (jobs, results, info, health, problem_pages):
         app.include_router(routes.router)
+        app.include_router(_heads_of(routes.router))
     app.add_middleware(NoSniff)
     app.add_middleware(LingeringClose)
     return app
+
+
+def _heads_of(router: APIRouter) -> APIRouter:
+    """Return HEAD routes for the GET routes of a router (RFC 9110, section 9.1)."""
+    heads = APIRouter()
+    for route in router.routes:
+        if isinstance(route, APIRoute) and "GET" in (route.methods or ()):
+            heads.add_api_route(
+                route.path, route.endpoint, methods=["HEAD"], include_in_schema=False
+            )
+    return heads
 
 
 def app_from_environment() -> FastAPI:

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from anyio import to_thread
-from starlette.responses import StreamingResponse
+from starlette.datastructures import Headers
+from starlette.responses import Response, StreamingResponse
 
 from service.archives import Member, archive_size, stream_archive
 from smsr.files.npy import HEADER_BYTES, parse_header
@@ -23,6 +24,8 @@ from worker.storage import ObjectMissing
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
+
+    from starlette.types import Receive, Scope, Send
 
     from worker.records import JobRecord
     from worker.storage import ObjectStorage
@@ -119,6 +122,8 @@ class ResultFiles:
         None where no faces were sent.
     finished : float
         Unix seconds; the time stamp of archive members.
+    tag : str
+        Different for each run of the job.
     """
 
     storage: ObjectStorage
@@ -127,6 +132,7 @@ class ResultFiles:
     translations: StoredArray
     faces: StoredArray | None
     finished: float
+    tag: str
 
     @classmethod
     async def open(
@@ -142,7 +148,9 @@ class ResultFiles:
         names = ARRAYS if faces else ARRAYS[:3]
         opened = await asyncio.gather(*(open_array(storage, prefix + name) for name in names))
         shapes, cameras, translations, *rest = opened
-        return cls(storage, shapes, cameras, translations, rest[0] if rest else None, finished)
+        tag = prefix.rstrip("/").rpartition("/")[2]
+        faces_array = rest[0] if rest else None
+        return cls(storage, shapes, cameras, translations, faces_array, finished, tag)
 
     @property
     def frames(self) -> int:
@@ -160,6 +168,16 @@ class ResultFiles:
         return self.faces.shape[0] if self.faces else 0
 
     # One frame
+
+    def frame(self, t: int, name: str) -> Download:
+        """Answer with frame t as a binary little-endian PLY."""
+        return Download(
+            self.ply(t),
+            size=self.ply_size(),
+            name=name,
+            tag=self.tag,
+            media_type="application/octet-stream",
+        )
 
     def _ply_header(self) -> bytes:
         return ply_header(self.points, self.face_count)
@@ -195,6 +213,16 @@ class ResultFiles:
             yield ply_face_block(np.frombuffer(chunk, self.faces.dtype).reshape(-1, 3))
 
     # Archives
+
+    def archive(self, members: list[Member], name: str) -> Download:
+        """Answer with a stored ZIP of `npz_members` or `ply_members`."""
+        return Download(
+            stream_archive(members, self.finished),
+            size=archive_size(members),
+            name=name,
+            tag=self.tag,
+            media_type="application/zip",
+        )
 
     def npz_members(self) -> list[Member]:
         """Return the members of result.npz, which are the stored files themselves."""
@@ -261,10 +289,8 @@ class OpenResults:
         return files
 
 
-def attachment(
-    chunks: AsyncIterator[bytes], *, size: int, name: str, media_type: str
-) -> StreamingResponse:
-    """Answer with a file of known length.
+class Download(StreamingResponse):
+    """A file of known length, streamed; also the answer to HEAD and to If-None-Match.
 
     Parameters
     ----------
@@ -274,25 +300,36 @@ def attachment(
     name : str
         File name offered to the client; ASCII letters, digits, dots and dashes only, so that it
         needs no quoting rules (RFC 6266, appendix D).
+    tag : str
+        Names the content: another run of the job has another tag (RFC 9110, section 8.8.3).
     media_type : str
     """
-    headers = {
-        "Content-Length": str(size),
-        "Content-Disposition": f'attachment; filename="{name}"',
-        # Results never change, but are nobody else's business.
-        "Cache-Control": "private, max-age=3600",
-    }
-    return StreamingResponse(chunks, media_type=media_type, headers=headers)
 
+    def __init__(
+        self, chunks: AsyncIterator[bytes], *, size: int, name: str, tag: str, media_type: str
+    ) -> None:
+        headers = {
+            "Content-Length": str(size),
+            "Content-Disposition": f'attachment; filename="{name}"',
+            "ETag": f'"{tag}"',
+            # To be kept by the client alone, and asked for again: a retry makes a new result.
+            "Cache-Control": "private, no-cache",
+        }
+        super().__init__(chunks, media_type=media_type, headers=headers)
 
-def archive(members: list[Member], *, name: str, modified: float) -> StreamingResponse:
-    """Answer with a stored ZIP of known length."""
-    return attachment(
-        stream_archive(members, modified),
-        size=archive_size(members),
-        name=name,
-        media_type="application/zip",
-    )
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send headers, and the content where it is wanted."""
+        known = Headers(scope=scope).get("if-none-match", "")
+        tags = {tag.strip().removeprefix("W/") for tag in known.split(",")}
+        if {"*", self.headers["etag"]} & tags:
+            kept = {name: self.headers[name] for name in ("etag", "cache-control")}
+            await Response(status_code=304, headers=kept)(scope, receive, send)
+        elif scope["method"] == "HEAD":
+            start = {"status": self.status_code, "headers": self.raw_headers}
+            await send({"type": "http.response.start", **start})
+            await send({"type": "http.response.body", "body": b""})
+        else:
+            await super().__call__(scope, receive, send)
 
 
 def diagnostics_of(report: bytes) -> Mapping[str, Any]:

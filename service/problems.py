@@ -443,14 +443,13 @@ async def _on_http_error(request: Request, failure: Exception) -> ProblemRespons
 def _methods_of(request: Request) -> list[str]:
     """Return all methods of a path; the router knows those of the first route that fits only."""
     path = request.scope["path"].removeprefix(request.scope.get("root_path", ""))
-    return sorted(
-        {
-            method.upper()
-            for template, operations in request.app.openapi()["paths"].items()
-            if compile_path(template)[0].match(path)
-            for method in operations
-        }
-    )
+    methods = {
+        method.upper()
+        for template, operations in request.app.openapi()["paths"].items()
+        if compile_path(template)[0].match(path)
+        for method in operations
+    }
+    return sorted(methods | ({"HEAD"} if "GET" in methods else set()))
 
 
 async def _on_redis_away(request: Request, error: Exception) -> ProblemResponse:

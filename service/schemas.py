@@ -167,7 +167,8 @@ class Job(BaseModel):
     progress: JobProgress | None
     timings: dict[str, float] = Field(description="Seconds by stage, in the queue and in total.")
     metrics: dict[str, Any] | None = Field(
-        description="Errors against the ground truth, where one was sent; `e3d` above all."
+        description="Errors against the ground truth, where one was sent; `e3d` above all. In a "
+        "list without those of single frames."
     )
     diagnostics: DiagnosticsSummary | None = Field(
         description="Of a job that succeeded, in the document of one job."
@@ -256,6 +257,7 @@ def job_document(
     root: str,
     position: int | None = None,
     diagnostics: Mapping[str, Any] | None = None,
+    brief: bool = False,
 ) -> Job:
     """Turn a job record into its document.
 
@@ -268,6 +270,8 @@ def job_document(
         Number of jobs before this one.
     diagnostics : mapping, optional
         The diagnostics of report.json.
+    brief : bool
+        Leave out what has an entry for every frame.
     """
     here = f"{root}/v1/jobs/{record.id}"
     done = record.status == "succeeded"
@@ -302,7 +306,7 @@ def job_document(
         if record.progress is not None
         else None,
         timings=dict(record.timings),
-        metrics=dict(record.metrics) if record.metrics is not None else None,
+        metrics=None if record.metrics is None else _metrics(record.metrics, brief=brief),
         diagnostics=DiagnosticsSummary.model_validate(diagnostics) if diagnostics else None,
         problem=problem,
         links=JobLinks(
@@ -314,6 +318,14 @@ def job_document(
             report=f"{here}/report.json" if done else None,
         ),
     )
+
+
+def _metrics(metrics: Mapping[str, Any], *, brief: bool) -> dict[str, Any]:
+    return {
+        name: value
+        for name, value in metrics.items()
+        if not (brief and isinstance(value, list | tuple))
+    }
 
 
 def option_document(option: OptionDescription) -> Option:

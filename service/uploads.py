@@ -366,6 +366,13 @@ def _boundary(request: Request) -> str:
             f"A job is sent as multipart/form-data, not as {kind or 'a body of unknown type'}.",
             headers={"Accept": "multipart/form-data"},
         )
+    coding = request.headers.get("content-encoding", "identity")
+    if coding.lower() != "identity":
+        raise Problem(
+            "unsupported-media-type",
+            f"The body is sent as it is, without Content-Encoding {coding}.",
+            headers={"Accept-Encoding": "identity"},  # RFC 9110, section 12.5.3
+        )
     boundary: str = parameters.get("boundary", "")
     if not boundary:
         raise Problem("malformed-multipart", "The Content-Type names no boundary.")

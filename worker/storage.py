@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterable, AsyncIterator, Iterator
 
 PART_BYTES = 8 << 20
+PARTS_AT_ONCE = 3
+"""Of an upload that arrives faster than it can be written: this bounds its memory."""
 CHUNK_BYTES = 1 << 20
 
 _KEY = re.compile(r"(?!.*(?:^|/)\.{1,2}(?:/|$))[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*")
@@ -125,7 +127,11 @@ class ObjectStorage:
         try:
             with _failures(key):
                 await obstore.put_async(
-                    self._store, _checked(key), meter.measure(chunks), chunk_size=PART_BYTES
+                    self._store,
+                    _checked(key),
+                    meter.measure(chunks),
+                    chunk_size=PART_BYTES,
+                    max_concurrency=PARTS_AT_ONCE,
                 )
                 await asyncio.to_thread(self._make_durable, key)
         except StorageError:

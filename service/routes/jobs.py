@@ -194,7 +194,8 @@ async def list_jobs(
         given = {name: value for name, value in query.items() if value is not None}
         following = f"{root}/v1/jobs?{urlencode(given)}"
         response.headers["Link"] = f'<{following}>; rel="next"'
-    return JobList(jobs=[job_document(r, root=root) for r in page.records], next=following)
+    jobs = [job_document(record, root=root, brief=True) for record in page.records]
+    return JobList(jobs=jobs, next=following)
 
 
 @router.get(

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Path, Response
 from starlette.responses import StreamingResponse
 
 from service.context import Context, JobId, Shared
-from service.downloads import ResultFiles, archive, attachment
+from service.downloads import Download, ResultFiles
 from service.problems import Problem, example_responses
 from worker.records import JobRecord
 
@@ -64,13 +64,13 @@ async def _open(shared: Context, job_id: str) -> ResultFiles:
     response_class=StreamingResponse,
     responses={200: _binary("application/zip", "Read it with numpy.load."), **_PROBLEMS},
 )
-async def get_npz(shared: Shared, job_id: JobId) -> StreamingResponse:
+async def get_npz(shared: Shared, job_id: JobId) -> Download:
     """Return arrays `shapes` (T, N, 3), `cameras` (T, 2, 3), `translations` (T, 2), and `faces`.
 
     W_t = R_t S_t + t_t. The archive is not compressed; its length is known in advance.
     """
     files = await _open(shared, job_id)
-    return archive(files.npz_members(), name=f"smsr-{job_id}.npz", modified=files.finished)
+    return files.archive(files.npz_members(), f"smsr-{job_id}.npz")
 
 
 @router.get(
@@ -79,10 +79,10 @@ async def get_npz(shared: Shared, job_id: JobId) -> StreamingResponse:
     response_class=StreamingResponse,
     responses={200: _binary("application/zip", "frame_0000.ply and so on."), **_PROBLEMS},
 )
-async def get_frames(shared: Shared, job_id: JobId) -> StreamingResponse:
+async def get_frames(shared: Shared, job_id: JobId) -> Download:
     """Return every frame as a binary PLY, with the faces where faces were sent."""
     files = await _open(shared, job_id)
-    return archive(files.ply_members(), name=f"smsr-{job_id}-frames.zip", modified=files.finished)
+    return files.archive(files.ply_members(), f"smsr-{job_id}-frames.zip")
 
 
 @router.get(
@@ -97,7 +97,7 @@ async def get_frames(shared: Shared, job_id: JobId) -> StreamingResponse:
 )
 async def get_frame(
     shared: Shared, job_id: JobId, frame: Annotated[int, Path(description="From 0.")]
-) -> StreamingResponse:
+) -> Download:
     """Return the surface of one frame."""
     files = await _open(shared, job_id)
     if not 0 <= frame < files.frames:
@@ -106,12 +106,7 @@ async def get_frame(
             f"There is no frame {frame}; the job has frames 0 to {files.frames - 1}.",
             frames=files.frames,
         )
-    return attachment(
-        files.ply(frame),
-        size=files.ply_size(),
-        name=f"smsr-{job_id}-frame-{frame:04d}.ply",
-        media_type="application/octet-stream",
-    )
+    return files.frame(frame, f"smsr-{job_id}-frame-{frame:04d}.ply")
 
 
 @router.get(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import zipfile
 from dataclasses import dataclass, field
@@ -240,6 +241,13 @@ def test_bodies_that_make_no_job(api: Api, client: httpx.Client, case: str) -> N
 def test_bodies_of_another_type(client: httpx.Client, kind: str) -> None:
     answer = client.post("/v1/jobs", content=b"{}", headers={"Content-Type": kind})
     problem(answer, "unsupported-media-type", 415)
+
+
+def test_a_compressed_body(client: httpx.Client) -> None:
+    headers = {**MULTIPART, "Content-Encoding": "gzip"}
+    answer = client.post("/v1/jobs", content=gzip.compress(W + END), headers=headers)
+    problem(answer, "unsupported-media-type", 415)
+    assert answer.headers["Accept-Encoding"] == "identity"
 
 
 def test_a_body_without_boundary(client: httpx.Client) -> None:

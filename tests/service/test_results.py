@@ -110,6 +110,36 @@ def test_the_archive_of_frames_holds_each_frame_as_it_is_alone(
             assert archive.read(f"frame_{t:04d}.ply") == alone
 
 
+def test_a_result_is_sent_again_only_when_it_is_another(
+    client: httpx.Client, bare_job: dict[str, Any]
+) -> None:
+    for url in (
+        bare_job["links"]["result"],
+        bare_job["links"]["frames"],
+        bare_job["links"]["frame"].replace("{t}", "0"),
+    ):
+        tag = client.get(url).headers["etag"]
+        for known in (tag, f'"x", W/{tag}', "*"):
+            answer = client.get(url, headers={"If-None-Match": known})
+            assert (answer.status_code, answer.content) == (304, b"")
+            assert answer.headers["etag"] == tag
+        assert client.get(url, headers={"If-None-Match": '"x"'}).status_code == 200
+    client.post(f"/v1/jobs/{bare_job['id']}/retry")
+    client.get(f"/v1/jobs/{bare_job['id']}", headers={"Prefer": "wait=30"})
+    answer = client.get(bare_job["links"]["result"], headers={"If-None-Match": tag})
+    assert answer.status_code == 200
+
+
+def test_head_tells_what_get_would(client: httpx.Client, job: dict[str, Any]) -> None:
+    frame = job["links"]["frame"].replace("{t}", "0")
+    links = [job["links"][name] for name in ("self", "result", "frames", "report")]
+    for url in (*links, frame, "/v1/jobs", "/v1/info", "/healthz", "/problems"):
+        got, asked = client.get(url), client.head(url)
+        assert (asked.status_code, asked.content) == (200, b"")
+        for name in ("content-type", "content-length", "content-disposition", "etag"):
+            assert asked.headers.get(name) == got.headers.get(name), (url, name)
+
+
 def test_frames_out_of_range(client: httpx.Client, job: dict[str, Any]) -> None:
     for frame in ("20", "-1", "99999999999999999999999"):
         answer = client.get(job["links"]["frame"].replace("{t}", frame))

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING
 import httpx
 import numpy as np
 import pytest
+from starlette.requests import Request
 
-from service.uploads import safe_name
+from service.problems import Problem
+from service.uploads import UploadLimits, receive_submission, safe_name
 from smsr.files import npy_header
 from tests.service.conftest import (
     UPLOAD_LIMIT,
@@ -28,10 +30,14 @@ from tests.service.conftest import (
     submit,
     wait_for,
 )
+from worker.records import new_job_id
+from worker.storage import ObjectStorage
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
+
+    from starlette.types import Message
 
     from tests.conftest import RedisProcess
 
@@ -156,7 +162,7 @@ def test_a_client_that_goes_away_leaves_nothing(idle_api: Api) -> None:
     wait_for(lambda: is_storing(idle_api))
     connection.close()
     wait_for(lambda: idle_api.left_behind() == before)
-    assert not list((idle_api.objects / "uploads").glob("*"))
+    wait_for(lambda: not list((idle_api.objects / "uploads").glob("*")))
     with idle_api.client() as client:
         assert client.get("/v1/jobs").json() == {"jobs": [], "next": None}
     assert "Traceback" not in idle_api.log.read_text()
@@ -165,7 +171,10 @@ def test_a_client_that_goes_away_leaves_nothing(idle_api: Api) -> None:
 def test_a_killed_server_loses_no_job_and_keeps_no_half_upload(
     tmp_path: Path, redis_process: RedisProcess, redis_url: str
 ) -> None:
-    """Killed in the middle of one upload, and between record and queue of another."""
+    """Killed in the middle of one upload, and between record and queue of another.
+
+    And Redis comes back later than the API.
+    """
     assert redis_url
     settings = settings_for(
         tmp_path, redis_process, orphan_grace_seconds=3, lost_ticket_seconds=0.5
@@ -180,7 +189,10 @@ def test_a_killed_server_loses_no_job_and_keeps_no_half_upload(
         api.process.wait()
         assert is_storing(api)
         redis.delete("rq:queue:smsr")
+    redis_process.kill()
     with api_running(settings, redis_process, tmp_path / "log") as api, api.client() as client:
+        problem(client.get("/readyz"), "not-ready", 503)  # it starts all the same
+        redis_process.start()
         wait_for(lambda: not is_storing(api), seconds=15)
         assert api.stored() == {str(api.objects / "uploads" / job_id / "measurements")}
         assert [job["id"] for job in client.get("/v1/jobs").json()["jobs"]] == [job_id]
@@ -308,6 +320,23 @@ def test_a_storage_that_cannot_be_written(idle_api: Api) -> None:
         finally:
             idle_api.objects.unlink()
         assert submit(client, good_files()).status_code == 201
+
+
+def test_an_upload_that_stalls_is_given_up(tmp_path: Path) -> None:
+    async def receive() -> Message:
+        if arrived:
+            return {"type": "http.request", "body": arrived.pop(), "more_body": True}
+        await asyncio.sleep(60)
+        raise AssertionError("nobody waits that long")
+
+    arrived = [PART + large(1)[0] + bytes(500_000)]
+    scope = {"type": "http", "method": "POST", "headers": [(b"content-type", MULTIPART.encode())]}
+    storage = ObjectStorage(tmp_path.as_uri())
+    limits = UploadLimits(UPLOAD_LIMIT, UPLOAD_LIMIT, idle_seconds=0.2)
+    with pytest.raises(Problem) as raised:
+        asyncio.run(receive_submission(Request(scope, receive), new_job_id(), storage, limits))
+    assert raised.value.type.slug == "upload-stalled"
+    assert not list(storage.list_prefix("uploads/"))
 
 
 @pytest.mark.parametrize(
