@@ -123,7 +123,7 @@ class Options:
         maximum=10.0,
     )
     motion_weight: float = option(
-        1.5,
+        0.5,
         "Weight of least motion between frames in the reweighted shape stage.",
         minimum=0.0,
         maximum=1000.0,

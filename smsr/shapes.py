@@ -94,6 +94,7 @@ class DepthProblem:
     RELAXATION = 1.6
     BALANCE_EVERY = 10
     BALANCE_RATIO = 5.0
+    STALLED = 0.9
 
     def __init__(self, measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> None:
         self.frames = len(rotations)
@@ -185,6 +186,17 @@ class DepthProblem:
         gradient: NDArray[np.float64] = np.cross(force, seen, axis=1).sum(axis=2)
         return gradient
 
+    def _penalty_change(self, primal: float, dual: float, convex: bool) -> float:
+        """Return the factor on the penalty that brings the residuals together."""
+        if not convex:
+            # With too small a penalty the iterates circle: raise it while nothing is gained.
+            before = self.residuals[-self.BALANCE_EVERY :][0]
+            stalled = max(primal, dual) > self.STALLED * before
+            return 2.0 if stalled or primal > self.BALANCE_RATIO * dual else 1.0
+        if primal > self.BALANCE_RATIO * dual:
+            return 2.0
+        return 0.5 if dual > self.BALANCE_RATIO * primal else 1.0
+
     def minimise(self, max_iterations: int, tolerance: float, hook: StageHook = ignore) -> bool:
         """Iterate from the present state; return whether both residuals met the tolerance."""
         if self.penalty == 0.0:
@@ -193,7 +205,8 @@ class DepthProblem:
         Z = S
         factor = self._banded_factor(self.penalty, self.motion_weight)
         # Reweighting gives small singular values large weights, and over-relaxed steps may cycle.
-        relaxation = self.RELAXATION if np.ndim(self.weights) == 0 else 1.0
+        convex = np.ndim(self.weights) == 0
+        relaxation = self.RELAXATION if convex else 1.0
         for iteration in range(1, max_iterations + 1):
             relaxed = relaxation * S + (1.0 - relaxation) * Z
             X = relaxed + Y
@@ -213,12 +226,8 @@ class DepthProblem:
             hook(iteration / max_iterations, len(self.residuals), self.residuals[-1])
             if self.residuals[-1] < tolerance:
                 break
-            if iteration % self.BALANCE_EVERY == 0 and not (
-                1.0 / self.BALANCE_RATIO
-                <= primal / max(dual, np.finfo(float).tiny)
-                <= self.BALANCE_RATIO
-            ):
-                change = 2.0 if primal > dual else 0.5
+            if iteration % self.BALANCE_EVERY == 0:
+                change = self._penalty_change(primal, dual, convex)
                 self.penalty *= change
                 Y = Y / change
                 factor = self._banded_factor(self.penalty, self.motion_weight)
@@ -374,7 +383,7 @@ def reweighted_shapes(
     measurements: NDArray[np.float64],
     rotations: NDArray[np.float64],
     *,
-    motion_weight: float = 1.5,
+    motion_weight: float = 0.5,
     max_iterations: int = 1000,
     tolerance: float = 1e-4,
     hook: StageHook = ignore,
