@@ -150,8 +150,9 @@ def evaluate(
         raise GroundTruthMismatch(
             "All true points coincide in every frame, so no error can be measured against them."
         )
-    distances = _distances(truth, shapes, moments, alignment @ turns)
-    free_distances = _distances(truth, shapes, moments, per_frame_alignment @ turns)
+    distances, free_distances = _distances(
+        truth, shapes, moments, [alignment @ turns, per_frame_alignment @ turns]
+    )
     per_frame = distances.sums / (sigma * points)
     extent = np.sqrt(np.einsum("tii->t", moments.truth))
     seen = extent > 0.0
@@ -316,19 +317,20 @@ def _distances(
     truth: NDArray[Any],
     shapes: NDArray[Any],
     moments: _Moments,
-    transforms: NDArray[np.float64],
-) -> _Distances:
+    candidates: list[NDArray[np.float64]],
+) -> list[_Distances]:
     """Distances between the centred truth and the centred shapes under (T, 3, 3) transforms."""
-    sums = np.zeros(len(transforms))
-    squares = np.zeros(len(transforms))
-    offset = (moments.truth_mean[:, :, None]) - transforms @ moments.shape_mean[:, :, None]
+    totals = [_Distances(np.zeros(len(truth)), np.zeros(len(truth))) for _ in candidates]
     for g, x in _blocks(truth, shapes):
-        g -= transforms @ x
-        g -= offset
-        squared = np.einsum("tin,tin->tn", g, g)
-        squares += squared.sum(axis=1)
-        sums += np.sqrt(squared).sum(axis=1)
-    return _Distances(sums, squares)
+        g -= moments.truth_mean[:, :, None]
+        x -= moments.shape_mean[:, :, None]
+        for transforms, total in zip(candidates, totals, strict=True):
+            difference = transforms @ x
+            difference -= g
+            squared = np.einsum("tin,tin->tn", difference, difference)
+            total.squares[:] += squared.sum(axis=1)
+            total.sums[:] += np.sqrt(squared, out=squared).sum(axis=1)
+    return totals
 
 
 def _detect_frame(
