@@ -98,12 +98,12 @@ def benchmark(
         return
     accuracy, cost = accuracy_rows(chosen, measured), cost_rows(measured[""])
     if markdown:
-        text = "\n\n".join((_markdown(accuracy), _markdown(cost), footnote(where)))
+        text = "\n\n".join((_markdown(accuracy), _markdown(cost), footnote(where, measured[""])))
         console.print(text, markup=False, soft_wrap=True)
         return
     console.print(_table(accuracy))
     console.print(_table(cost))
-    console.print(footnote(where), style="dim")
+    console.print(footnote(where, measured[""]), style="dim")
     for method, source in METHODS.items():
         console.print(f"{method}: {source}", style="dim")
 
@@ -137,7 +137,7 @@ def accuracy_rows(
 
 def cost_rows(measured: Sequence[Measurement]) -> list[list[str]]:
     """Return size, time and memory of every set; the first row is the heading."""
-    head = ["set", "T", "N", "K", "camera", "seconds", "peak MiB", "of it at start", "converged"]
+    head = ["set", "T", "N", "K", "camera", "seconds", "peak MiB", "converged"]
     return [head] + [
         [
             one.name,
@@ -147,20 +147,20 @@ def cost_rows(measured: Sequence[Measurement]) -> list[list[str]]:
             one.camera_model,
             f"{one.seconds:.2f}",
             f"{one.peak_bytes / MEBIBYTE:.0f}",
-            f"{one.start_bytes / MEBIBYTE:.0f}",
             "yes" if one.converged else "no",
         ]
         for one in measured
     ]
 
 
-def footnote(where: Environment) -> str:
+def footnote(where: Environment, measured: Sequence[Measurement]) -> str:
     """Say what the figures were measured with."""
+    start = max(one.start_bytes for one in measured) / MEBIBYTE
     return (
         f"smsr {where.smsr}, Python {where.python}, NumPy {where.numpy}, SciPy {where.scipy}, "
         f"{where.blas} on {where.blas_threads} thread(s), {where.machine} with {where.processors} "
         "processors. Seconds are wall time of the reconstruction, writing included; peak memory is "
-        "that of its process, mapped files included."
+        f"that of its process, {start:.0f} MiB of it Python and its libraries."
     )
 
 
@@ -181,7 +181,10 @@ def _table(rows: Sequence[Sequence[str]]) -> Table:
     head, *body = rows
     table = Table(header_style="bold")
     for column, name in enumerate(head):
-        table.add_column(name, justify="left" if column == 0 else "right")
+        if column == 0:
+            table.add_column(name, overflow="fold")
+        else:
+            table.add_column(name, justify="right")
     for row in body:
         table.add_row(*row, style="bold" if row[0].startswith(OURS) else None)
     return table

@@ -23,9 +23,11 @@ import numpy as np
 import scipy
 import threadpoolctl
 
-import smsr
+from smsr import __version__
 from smsr.benchmark.datasets import Dataset, load
+from smsr.metrics import evaluate
 from smsr.options import Options, parse
+from smsr.pipeline import reconstruct
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -99,15 +101,19 @@ class BenchmarkFailed(RuntimeError):
 
 def environment(threads: int) -> Environment:
     """Describe this interpreter, its libraries and its machine."""
-    pools = [pool for pool in threadpoolctl.threadpool_info() if pool["user_api"] == "blas"]
+    blas = {
+        f"{pool['internal_api']} {pool['version']}"
+        for pool in threadpoolctl.threadpool_info()
+        if pool["user_api"] == "blas"
+    }
     return Environment(
-        smsr=smsr.__version__,
+        smsr=__version__,
         python=platform.python_version(),
         numpy=np.__version__,
         scipy=scipy.__version__,
         machine=platform.machine(),
         processors=os.cpu_count() or 1,
-        blas=" ".join(str(pools[0][k]) for k in ("internal_api", "version")) if pools else "none",
+        blas=", ".join(sorted(blas)) or "unknown BLAS",
         blas_threads=threads,
     )
 
@@ -118,12 +124,10 @@ def measure(dataset: Dataset, folder: Path, options: Options) -> Measurement:
     measurements, truths = load(dataset, folder)
     with tempfile.TemporaryDirectory(prefix="smsr-benchmark-") as scratch:
         begun = time.perf_counter()
-        result = smsr.reconstruct(measurements, out=Path(scratch), options=options)
+        result = reconstruct(measurements, out=Path(scratch), options=options)
         seconds = time.perf_counter() - begun
         peak_bytes = _peak_bytes()
-        errors = {
-            frame: smsr.evaluate(truth, result, frame=frame) for frame, truth in truths.items()
-        }
+        errors = {frame: evaluate(truth, result, frame=frame) for frame, truth in truths.items()}
         return Measurement(
             name=dataset.name,
             frames=result.diagnostics.frames,
