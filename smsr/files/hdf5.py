@@ -32,6 +32,9 @@ _PROCESS = Path(__file__).with_name("hdf5_process.py")
 _BLOCK = 16 * 2**20
 _LONGEST_LINE = 16 * 2**20
 _REAL = re.compile(r"[<>|](f[248]|[iu][1248])")
+_INHERITED = ("PATH", "PYTHONPATH", "PYTHONHOME", "LD_LIBRARY_PATH", "SYSTEMROOT")
+"""What Python needs to start; secrets of the service are no business of a file's reader."""
+
 _ENVIRONMENT = {
     "HDF5_PLUGIN_PRELOAD": "::",  # no filters from shared libraries
     "HDF5_USE_FILE_LOCKING": "FALSE",  # files on read-only and network storage
@@ -49,7 +52,7 @@ def open_hdf5(path: Path, limit: int) -> Iterator[list[StoredArray]]:  # noqa: A
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=os.environ | _ENVIRONMENT,
+        env={name: os.environ[name] for name in _INHERITED if name in os.environ} | _ENVIRONMENT,
     ) as process:
         assert process.stdin is not None  # noqa: S101
         assert process.stdout is not None  # noqa: S101

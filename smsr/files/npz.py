@@ -1,7 +1,8 @@
 """The .npz format: a zip of .npy files. Stored members are mapped, deflated ones inflated.
 
 Sizes in a zip directory can lie, so an array's size is taken from its own .npy header, and no more
-than that many bytes are ever inflated. Layout of a zip: PKWARE's APPNOTE.TXT.
+than that many bytes are ever inflated. A member's checksum is verified where it is inflated; a map
+is not read, so there it is not. Layout of a zip: PKWARE's APPNOTE.TXT.
 """
 
 from __future__ import annotations

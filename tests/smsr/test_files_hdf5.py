@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-import os
+import json
+import subprocess
 import time
 import zlib
 from typing import TYPE_CHECKING, Any
@@ -192,13 +193,36 @@ def test_a_file_that_kills_the_reading_process_is_unreadable(
             open_array(path)
 
 
-def test_no_process_is_left_behind(tmp_path: Path) -> None:
+def test_no_process_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "w.h5"
     with h5py.File(path, "w") as file:
         file["W"] = W
         file["V"] = W
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Recorded(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Recorded)
     open_array(path, key="W")
     with pytest.raises(ArrayNotFound):
         open_array(path, key="X")
-    with pytest.raises(ChildProcessError):  # none running and none to be waited for
-        os.waitpid(-1, os.WNOHANG)
+    assert len(started) == 2
+    assert all(process.returncode is not None for process in started)
+
+
+def test_the_reading_process_is_told_no_secrets(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = tmp_path / "told.json"
+    spy = tmp_path / "spy.py"
+    spy.write_text(f"import json, os\njson.dump(dict(os.environ), open({str(told)!r}, 'w'))\n")
+    monkeypatch.setattr(hdf5, "_PROCESS", spy)
+    monkeypatch.setenv("SMSR_STORAGE_SECRET", "x")
+    with h5py.File(tmp_path / "w.h5", "w") as file:
+        file["W"] = W
+    with pytest.raises(UnreadableFile):
+        open_array(tmp_path / "w.h5")
+    assert "SMSR_STORAGE_SECRET" not in json.loads(told.read_text())
