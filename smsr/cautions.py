@@ -63,7 +63,9 @@ def input_cautions(values: NDArray[np.float64], kept: int) -> list[Caution]:
 def camera_cautions(rotations: NDArray[np.float64]) -> list[Caution]:
     """Judge cameras (T, 3, 3) by how far their viewing directions spread."""
     axes = rotations[:, 2]
-    spread = math.acos(min(1.0, max(-1.0, float((axes @ axes.T).min()))))
+    # The farthest from the farthest: nearly the widest angle, without comparing all pairs.
+    far = axes[(axes @ axes[0]).argmin()]
+    spread = math.acos(min(1.0, max(-1.0, float((axes @ far).min()))))
     if spread >= _LITTLE_ROTATION:
         return []
     return [

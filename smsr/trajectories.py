@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.fft import idct
+from scipy.fft import dct, idct
 
 from smsr.progress import ignore
 
@@ -55,10 +55,16 @@ class SmoothMotion:
         return smoothed
 
 
-def cosine_basis(frames: int, count: int) -> NDArray[np.float64]:
-    """Return Omega_d (T, d), the first columns of the orthonormal discrete cosine transform."""
-    basis: NDArray[np.float64] = idct(np.eye(frames)[:, :count], axis=0, norm="ortho")
-    return basis
+def from_cosines(X: NDArray[np.float64], frames: int) -> NDArray[np.float64]:
+    """Return Omega_d X (T, K), trajectories from the first coefficients (d, K) of their cosines."""
+    trajectories: NDArray[np.float64] = idct(X, n=frames, axis=0, norm="ortho")
+    return trajectories
+
+
+def to_cosines(trajectories: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return Omega_d^T C (d, K), the first coefficients of the cosines of trajectories (T, K)."""
+    coefficients: NDArray[np.float64] = dct(trajectories, axis=0, norm="ortho")[:count]
+    return coefficients
 
 
 def motion_matrix(
@@ -78,8 +84,6 @@ class Linearisation:
         W.
     cameras : ndarray of shape (T, 2, 3)
         R.
-    omega : ndarray of shape (T, d)
-        Omega_d.
     X : ndarray of shape (d, K)
         Coefficients.
 
@@ -95,12 +99,13 @@ class Linearisation:
         self,
         measurements: NDArray[np.float64],
         cameras: NDArray[np.float64],
-        omega: NDArray[np.float64],
         X: NDArray[np.float64],
     ) -> None:
-        self.omega = omega
         frames = len(cameras)
-        left, values, right = np.linalg.svd(motion_matrix(cameras, omega @ X), full_matrices=False)
+        left, values, right = np.linalg.svd(
+            motion_matrix(cameras, from_cosines(X, frames)), full_matrices=False
+        )
+        self._cosines = len(X)
         rank = int((values > 1e-10 * values[0]).sum())
         self.basis = left[:, :rank]
         inside = self.basis.T @ measurements
@@ -112,15 +117,16 @@ class Linearisation:
 
     def forward(self, dX: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the change (2T, N) of the modelled measurements along dX, outside their span."""
-        change = ((self.omega @ dX)[:, None, :] @ self._seen).reshape(self.residual.shape)
+        change = (from_cosines(dX, len(self._seen))[:, None, :] @ self._seen).reshape(
+            self.residual.shape
+        )
         outside: NDArray[np.float64] = change - self.basis @ (self.basis.T @ change)
         return outside
 
     def adjoint(self, residual: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the adjoint (d, K) of `forward` for a residual that is outside the span."""
         each = self._seen @ residual.reshape(len(self._seen), -1, 1)
-        gathered: NDArray[np.float64] = self.omega.T @ each[:, :, 0]
-        return gathered
+        return to_cosines(each[:, :, 0], self._cosines)
 
 
 _INNER_STEPS = 40
@@ -160,10 +166,9 @@ def smooth_trajectories(
         See `smsr.progress.StageHook`.
     """
     cameras = rotations[:, :2]
-    omega = cosine_basis(len(rotations), cosines)
     X = np.eye(cosines, basis_size)
     size = max(float(np.linalg.norm(measurements)), np.finfo(float).tiny)
-    now = Linearisation(measurements, cameras, omega, X)
+    now = Linearisation(measurements, cameras, X)
     cost = float(np.linalg.norm(now.residual)) / size
     residuals = [cost]
     damping, converged = 1e-3, cost < 1e-12
@@ -171,7 +176,7 @@ def smooth_trajectories(
         if converged:
             break
         step = _damped_step(now, damping)
-        trial = Linearisation(measurements, cameras, omega, X + step)
+        trial = Linearisation(measurements, cameras, X + step)
         trial_cost = float(np.linalg.norm(trial.residual)) / size
         if trial_cost < cost:
             converged = cost**2 - trial_cost**2 < tolerance * cost**2
