@@ -101,3 +101,59 @@ def _most_central(
     distances = np.linalg.norm(back[:, None] - back, axis=(2, 3)).sum(axis=1)
     central: NDArray[np.float64] = back[distances.argmin()]
     return central
+
+
+def refine_uniform_turn(
+    measurements: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    *,
+    motion_weight: float,
+    evaluations: int = 30,
+    hook: StageHook = ignore,
+) -> NDArray[np.float64]:
+    """Return the velocity near a first one whose best shape has least energy.
+
+    The energy is ``||P S#||_* + lambda/2 ||D S#||_F^2``, minimised over the shapes with W = R S
+    for each velocity and over the velocity by L-BFGS.
+
+    Parameters
+    ----------
+    measurements : ndarray of shape (2T, N)
+        W, centred, rows u1, v1, u2, ...
+    velocity, middle
+        As from `fit_uniform_turn`.
+    motion_weight : float
+        Lambda.
+    evaluations : int
+        Most evaluations of the energy.
+    hook : callable
+        See `smsr.progress.StageHook`.
+    """
+    frames = len(measurements) // 2
+    time = np.arange(frames) - frames // 2
+    problem = DepthProblem(measurements, turning_cameras(velocity, middle, frames))
+    problem.start_from_least_motion()
+    problem.motion_weight = motion_weight
+    count = 0
+
+    def energy(x: NDArray[np.float64], *_: object) -> tuple[float, NDArray[np.float64]]:
+        nonlocal count
+        now = velocity + x / frames
+        problem.turn_to(turning_cameras(now, middle, frames))
+        problem.minimise(60, 3e-4)
+        count += 1
+        hook(min(count / evaluations, 1.0), count, problem.residuals[-1])
+        jacobian = so3.left_jacobian(time[:, None] * now) * time[:, None, None]
+        gradient = np.einsum("tij,ti->j", jacobian, problem.camera_gradient()) / frames
+        return problem.value(), gradient
+
+    found = minimize(
+        energy,
+        np.zeros(3),
+        jac=True,
+        method="L-BFGS-B",
+        options={"maxiter": evaluations, "maxfun": evaluations},
+    )
+    refined: NDArray[np.float64] = velocity + found.x / frames
+    return refined
