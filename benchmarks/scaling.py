@@ -64,6 +64,8 @@ class Row:
     workers: int
     jobs_per_second: float
     run_seconds: float
+    cores: float
+    """Processor seconds of all its processes a second: other programs may have had the rest."""
     quiet: Load
     busy: Load
     jobs: int
@@ -85,6 +87,21 @@ def difference(before: Load, after: Load) -> Load:
     )
 
 
+def processor_seconds(root: int) -> float:
+    """Return what a process and all that descend from it have used, those that ended included."""
+    used, parents = {}, {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = path.read_text().rpartition(")")[2].split()
+            parents[int(path.parent.name)] = int(fields[1])
+            used[int(path.parent.name)] = sum(map(int, fields[11:15]))
+    tree, found = {root}, 0
+    while len(tree) > found:
+        found = len(tree)
+        tree |= {child for child, parent in parents.items() if parent in tree}
+    return sum(used.get(process, 0) for process in tree) / os.sysconf("SC_CLK_TCK")
+
+
 @contextlib.contextmanager
 def redis_server(folder: Path) -> Iterator[str]:
     """Run a Redis server that syncs every write, as in docker/compose.yaml."""
@@ -104,8 +121,8 @@ def redis_server(folder: Path) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def service(folder: Path, url: str, workers: int, threads: int) -> Iterator[str]:
-    """Run the API and its workers until the block ends."""
+def service(folder: Path, url: str, workers: int, threads: int) -> Iterator[tuple[str, int]]:
+    """Run the API and its workers until the block ends; yield address and process."""
     environment = os.environ | {
         "REDIS_URL": url,
         "SMSR_THREADS": str(threads),
@@ -122,7 +139,7 @@ def service(folder: Path, url: str, workers: int, threads: int) -> Iterator[str]
             server = process.stdout.readline().split()[-1]
             while httpx.get(f"{server}/readyz").json().get("workers", 0) < workers:
                 time.sleep(0.2)
-            yield server
+            yield server, process.pid
         finally:
             process.terminate()
 
@@ -132,24 +149,26 @@ def measure(workers: int, jobs: int, threads: int, tracks: Path) -> Row:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="smsr-scaling-")))
         url = stack.enter_context(redis_server(folder))
-        server = stack.enter_context(service(folder / "data", url, workers, threads))
+        server, process = stack.enter_context(service(folder / "data", url, workers, threads))
         counters = stack.enter_context(redis.Redis.from_url(url))
         client = stack.enter_context(Client(server))
         time.sleep(3)
         start = reading(counters)
         time.sleep(QUIET_SECONDS)
-        middle = reading(counters)
+        middle, used = reading(counters), processor_seconds(process)
         pool = stack.enter_context(ThreadPoolExecutor(max_workers=jobs))
         sent = [client.submit(tracks).id for _ in range(jobs)]
         ended = [*pool.map(lambda job: client.wait(job, timeout=1800), sent)]
-        end = reading(counters)
-    assert all(job.status == "succeeded" for job in ended), ended
+        end, used = reading(counters), processor_seconds(process) - used
+    if failed := [job.problem for job in ended if job.status != "succeeded"]:
+        raise SystemExit(f"{len(failed)} jobs failed: {failed[0]}")
     begun = [job.started_at.timestamp() for job in ended if job.started_at]
     finished = [job.finished_at.timestamp() for job in ended if job.finished_at]
     return Row(
         workers,
         jobs / (max(finished) - min(begun)),
         statistics.median(f - b for b, f in zip(begun, finished, strict=True)),
+        used / (end.seconds - middle.seconds),
         difference(start, middle),
         difference(middle, end),
         jobs,
@@ -161,15 +180,15 @@ def table(rows: list[Row], threads: int) -> str:
     lines = [
         f"{os.cpu_count()} cores, {threads} BLAS thread(s) a worker",
         "",
-        "| workers | jobs/s | median run, s | Redis, quiet, requests/s | a job | Redis CPU, busy |",
-        "|---:|---:|---:|---:|---:|---:|",
+        "| workers | jobs/s | median run, s | cores got | Redis, quiet, requests/s | a job | CPU |",
+        "|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
         quiet = row.quiet.requests / row.quiet.seconds
         per_job = (row.busy.requests - quiet * row.busy.seconds) / row.jobs
         lines.append(
-            f"| {row.workers} | {row.jobs_per_second:.2f} | {row.run_seconds:.2f} | {quiet:.1f} "
-            f"| {per_job:.0f} | {row.busy.processor / row.busy.seconds:.1%} |"
+            f"| {row.workers} | {row.jobs_per_second:.2f} | {row.run_seconds:.2f} "
+            f"| {row.cores:.2f} | {quiet:.1f} | {per_job:.0f} | {row.busy.processor / row.busy.seconds:.1%} |"
         )
     return "\n".join(lines)
 

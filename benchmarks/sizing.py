@@ -74,7 +74,7 @@ def main() -> None:
     print("| frames | points | memory, MiB | seconds | CPU seconds |\n|---:|---:|---:|---:|---:|")
     for frames in arguments.frames:
         for points in arguments.points:
-            if frames * points > 200_000_000:
+            if frames * points > 100_000_000:
                 continue
             found = measure(frames, points)
             mebibytes = found["bytes"] / (1 << 20)

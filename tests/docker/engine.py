@@ -24,6 +24,12 @@ def docker(*arguments: str, check: bool = True, timeout: float = 600) -> str:
     return _run(["docker", *arguments], {}, check=check, timeout=timeout)
 
 
+def logs(name: str) -> str:
+    """Return the last lines that a container wrote, to either output."""
+    done = subprocess.run(["docker", "logs", "--tail", "50", name], capture_output=True, text=True)
+    return done.stdout + done.stderr
+
+
 def inspect(name: str) -> dict[str, Any]:
     """Return what the engine knows of a container or an image."""
     described: dict[str, Any] = json.loads(docker("inspect", name))[0]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import re
@@ -20,7 +21,7 @@ import pytest
 
 from service.client import Client
 from smsr.synthetic import make_example
-from tests.docker.engine import REPOSITORY, Compose, docker, inspect
+from tests.docker.engine import REPOSITORY, Compose, docker, inspect, logs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -132,6 +133,11 @@ def until(condition: Callable[[], object], seconds: float = 60) -> None:
         time.sleep(0.1)
 
 
+def too_large() -> Array:
+    """Frames and points both in thousands, and no structure: the solver asks for over a GiB."""
+    return np.random.default_rng(0).standard_normal((4000, 4000), dtype=np.float32)
+
+
 def worker_of(cluster: Compose, job: Job) -> str | None:
     """Return the container that runs a job."""
     redis = cluster.container("redis")
@@ -202,22 +208,47 @@ def test_threads_follow_the_cpu_limit(image: str, cpus: str, threads: int) -> No
     assert started == f"{{{expected}}} {expected}"
 
 
-def test_one_container_serves_with_a_redis_of_its_own(image: str) -> None:
-    """Without REDIS_URL the image is the whole service, read-only root or not."""
+@contextlib.contextmanager
+def alone(image: str, *options: str) -> Iterator[str]:
+    """Run one container that is the whole service; yield its name once it is healthy."""
     name = "smsr-test-alone"
     docker(
         "run", "--detach", "--name", name, "--read-only", "--cap-drop", "ALL", "--tmpfs", "/tmp",
-        "--volume", f"{name}:/data", image,
+        "--volume", f"{name}:/data", *options, image,
     )  # fmt: skip
     try:
         until(lambda: inspect(name)["State"]["Health"]["Status"] == "healthy")
-        started = time.monotonic()
-        docker("stop", "--time", "30", name)
-        assert time.monotonic() - started < 15
-        assert inspect(name)["State"]["ExitCode"] == 0
+        yield name
     finally:
+        log.info("logs:\n%s", logs(name))
         docker("rm", "--force", name)
         docker("volume", "rm", name)
+
+
+def test_one_container_serves_with_a_redis_of_its_own(image: str) -> None:
+    """Without REDIS_URL the image is the whole service, and ends in order."""
+    with alone(image) as name:
+        started = time.monotonic()
+        docker("stop", "--time", "30", name)
+        assert time.monotonic() - started < 20
+        assert inspect(name)["State"]["ExitCode"] == 0
+
+
+def test_a_job_that_the_kernel_kills_fails_clearly_too(image: str, tmp_path: Path) -> None:
+    """Where the budget is set too high, the kernel ends the job; it is not tried for ever."""
+    port = free_port()
+    options = ["--memory", "400m", "--memory-swap", "400m", "--publish", f"127.0.0.1:{port}:8000"]
+    options += ["--env", f"SMSR_JOB_MEMORY_BYTES={1 << 40}"]
+    with alone(image, *options) as name, Client(f"http://127.0.0.1:{port}") as client:
+        sender = Sender(client, tmp_path)
+        ended = client.wait(sender.send(too_large()).id, timeout=300)
+        assert ended.status == "failed"
+        assert ended.problem is not None
+        assert ended.problem.type == "/problems/out-of-memory"
+        assert 1 < ended.attempt <= 4
+        assert httpx.get(f"http://127.0.0.1:{port}/readyz").status_code == 200
+        assert inspect(name)["RestartCount"] == 0
+        test_smoke_job(sender)
 
 
 # The cluster
@@ -301,10 +332,8 @@ def test_a_container_that_dies_comes_back_by_itself(cluster: Compose) -> None:
 
 
 def test_a_job_over_the_memory_limit_fails_clearly(cluster: Compose, sender: Sender) -> None:
-    """Frames and points both in thousands, and tracks that have no structure: the hardest case."""
     before = {name: inspect(name)["State"]["StartedAt"] for name in cluster.containers("worker")}
-    rng = np.random.default_rng(0)
-    large = sender.send(rng.standard_normal((4000, 4000), dtype=np.float32))
+    large = sender.send(too_large())
     ended = sender.client.wait(large.id, timeout=300)
     assert ended.status == "failed"
     assert ended.problem is not None
