@@ -11,8 +11,18 @@ from __future__ import annotations
 
 import mmap
 import os
+import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    Protocol,
+    TypeAlias,
+    TypeGuard,
+    TypeVar,
+    runtime_checkable,
+)
 
 import numpy as np
 
@@ -32,6 +42,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from smsr.mapping import Operator
+    from smsr.progress import StageHook
+
+Result = TypeVar("Result")
 Layout: TypeAlias = Literal["auto", "interleaved", "stacked"]
 Chunk: TypeAlias = "tuple[slice, NDArray[Any]]"
 
@@ -79,6 +93,35 @@ class MeasurementSource(Protocol):
         block : ndarray of shape (2T, n)
             Rows u1, v1, u2, v2, ...; not to be written to.
         """
+        ...
+
+
+@runtime_checkable
+class RemoteSource(MeasurementSource, Protocol):
+    """A source whose blocks are elsewhere, so that the work is better taken to them."""
+
+    def first_point(self) -> NDArray[Any]:
+        """Return the first column (2T,) of W."""
+        ...
+
+    def map(
+        self, work: Callable[[slice, NDArray[Any]], Result], size: int, workers: int | None
+    ) -> Iterator[tuple[int, Result]]:
+        """Apply `work` to all blocks; see `smsr.streaming.map_chunks`."""
+        ...
+
+    def map_back(
+        self,
+        operator: Operator,
+        means: NDArray[np.float64],
+        out: NDArray[np.floating[Any]] | str | os.PathLike[str] | None,
+        dtype: np.dtype[Any],
+        *,
+        size: int,
+        workers: int | None,
+        progress: StageHook,
+    ) -> Any:
+        """Write the shapes of all points; see `smsr.rowspace.map_back`."""
         ...
 
 
@@ -191,8 +234,9 @@ def as_source(
     ----------
     measurements : ndarray, memmap, path or MeasurementSource
         W as (2T, N), (T, 2, N), (T, N, 2) or, stacked, (2T, N) with all u rows first or (2, T, N);
-        the path of a file that `smsr.files.open_array` reads; or a source, which passes unchanged.
-        For data that come as an iterator of blocks see `ChunkedSource`.
+        the path of a file that `smsr.files.open_array` reads; a dask array (`smsr.cluster`); or a
+        source, which passes unchanged. For data that come as an iterator of blocks see
+        `ChunkedSource`.
     layout : {"auto", "interleaved", "stacked"}
         Row order of a 2-D array. "auto" takes it as interleaved and recognises (T, 2, N) and
         (T, N, 2).
@@ -217,6 +261,15 @@ def as_source(
         _check_dtype(np.dtype(measurements.dtype))
         _check_size(measurements.frames, measurements.points)
         return measurements
+    if _is_dask(measurements):
+        from smsr.cluster import DaskSource
+
+        _check_dtype(measurements.dtype)
+        tracks: Any = _tracks(measurements, layout)
+        _check_size(tracks.shape[0], tracks.shape[2])
+        if measurements.ndim == 2 and layout != "stacked":
+            return DaskSource(measurements)  # as it is: a reshape would cut its chunks
+        return DaskSource(tracks.reshape(-1, tracks.shape[2]))
     array = _as_array(measurements)
     _check_dtype(array.dtype)
     source = ArraySource(_tracks(array, layout))
@@ -308,6 +361,12 @@ def _not_finite(first: tuple[int, int], count: int, source: MeasurementSource) -
         coordinate=coordinate,
         count=count,
     )
+
+
+def _is_dask(measurements: object) -> TypeGuard[Any]:
+    """Tell a dask array without importing dask: who has one has imported it."""
+    module = sys.modules.get("dask.array")
+    return module is not None and isinstance(measurements, module.Array)
 
 
 def _as_array(measurements: object) -> NDArray[Any]:

@@ -66,6 +66,11 @@ class Diagnostics:
         Which camera candidate was taken.
     camera_reason : str
         Why.
+    camera_criteria : dict
+        The numbers that choice was based on: see `smsr.cameras.free` and `smsr.cameras.selection`.
+    noise : float
+        Standard deviation of the noise that was taken off the measurements, in their units; 0 for
+        none.
     converged : bool
         Whether every iterative stage met its tolerance.
     stages : tuple of StageReport
@@ -82,6 +87,8 @@ class Diagnostics:
     basis_size: int
     camera_model: str
     camera_reason: str
+    camera_criteria: dict[str, float]
+    noise: float
     converged: bool
     stages: tuple[StageReport, ...]
     singular_values: tuple[float, ...]
@@ -105,7 +112,8 @@ class Reconstruction:
     ----------
     shapes : ndarray of shape (T, N, 3), float32 or float64, read-only
         S: points of each frame in the object frame, in the units of the measurements, each frame
-        centred on the origin. Memory-mapped where the run wrote to a folder.
+        centred on the origin. Memory-mapped where the run wrote to a folder; a lazy dask array on
+        a zarr store where the measurements were a dask array too.
     cameras : ndarray of shape (T, 2, 3), float64, read-only
         R: orthonormal rows of the orthographic camera of each frame.
     translations : ndarray of shape (T, 2), float64, read-only
@@ -121,7 +129,8 @@ class Reconstruction:
 
     def __post_init__(self) -> None:
         for array in (self.shapes, self.cameras, self.translations):
-            array.flags.writeable = False
+            if isinstance(array, np.ndarray):  # a dask array is read-only by itself
+                array.flags.writeable = False
 
     @property
     def rotations(self) -> NDArray[np.float64]:

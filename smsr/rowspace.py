@@ -13,6 +13,7 @@ Gram matrix W W^T would be cheaper, and would lose half of the digits of the sma
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,7 @@ from smsr.errors import InputError
 from smsr.mapping import Operator, Workspace, single_precision_serves
 from smsr.measurements import (
     CHUNK_BYTES,
+    RemoteSource,
     check_values,
     chunk_points,
     constant_measurements,
@@ -34,6 +36,7 @@ from smsr.triangles import NotUsableError, Triangle, merged, triangle_of
 
 if TYPE_CHECKING:
     import os
+    from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
@@ -115,17 +118,20 @@ def factorise(
     InputError
         Entries too large for double precision.
     """
-    chunks = checked_chunks(source, _factor_chunk(source, chunk_bytes))
-    first = next(chunks)
     # Differences to a point of the data are exact or nearly so: a far translation is gone before
     # anything is added or multiplied, and costs no digits.
-    shift = np.array(first[1][:, 0], dtype=np.float64)
-
-    def work(_points: slice, block: NDArray[Any]) -> Triangle:
-        return triangle_of(block, shift)
-
+    size = _factor_chunk(source, chunk_bytes)
+    triangles: Iterator[tuple[int, Triangle]]
+    if isinstance(source, RemoteSource):
+        shift = source.first_point().astype(np.float64)
+        triangles = source.map(partial(_reduce, shift=shift), size, workers)
+    else:
+        chunks = checked_chunks(source, size)
+        first = next(chunks)
+        shift = first[1][:, 0].astype(np.float64)
+        work = partial(_reduce, shift=shift)
+        triangles = map_chunks(work, chain([first], chunks), workers or blas_threads())
     waiting: list[Triangle] = []
-    triangles = map_chunks(work, chain([first], chunks), workers or blas_threads())
     try:
         for index, (stop, triangle) in enumerate(triangles, 1):
             waiting.append(triangle)
@@ -136,6 +142,11 @@ def factorise(
         check_values(source)
         raise _too_large() from None
     return _row_space(merged(waiting), shift, source)
+
+
+def _reduce(_points: slice, block: NDArray[Any], *, shift: NDArray[np.float64]) -> Triangle:
+    """Return what stays of a block."""
+    return triangle_of(block, shift)
 
 
 def _factor_chunk(source: MeasurementSource, chunk_bytes: int) -> int:
@@ -209,7 +220,8 @@ def map_back(
     Returns
     -------
     ndarray of shape (T, N, 3)
-        S: `out`, the new array, or a read-only map of the file.
+        S: `out`, the new array, or a read-only map of the file. For a dask array and a folder, a
+        lazy dask array; the folder then holds ``shapes.zarr``.
 
     Raises
     ------
@@ -224,8 +236,15 @@ def map_back(
     terms, known from A and L, stays below 1e-6 of the shapes; otherwise in double.
     """
     points = source.points
-    sink = sink_for(out, source.frames, points, _result_dtype(source.dtype))
     size = min(points, chunk_points(source, chunk_bytes))
+    if isinstance(source, RemoteSource):
+        dtype = _output_dtype(out, source)
+        operator = _operator(A, rowspace, dtype)
+        far: NDArray[np.floating[Any]] = source.map_back(
+            operator, rowspace.means, out, dtype, size=size, workers=workers, progress=progress
+        )
+        return far
+    sink = sink_for(out, source.frames, points, _output_dtype(out, source))
     workers = min(workers or blas_threads(), -(-points // size))
     spaces: SimpleQueue[Workspace] = SimpleQueue()
 
@@ -253,10 +272,15 @@ def map_back(
     return sink.finish()
 
 
-def _result_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the precision of shapes from measurements of this type."""
-    narrow = np.dtype(dtype).itemsize <= np.dtype(np.float32).itemsize and dtype.kind == "f"
-    return np.dtype(np.float32 if narrow else np.float64)
+def _output_dtype(
+    out: NDArray[np.floating[Any]] | str | os.PathLike[str] | None, source: MeasurementSource
+) -> np.dtype[Any]:
+    """Return the precision of the shapes: that of the array, of files, or of the measurements."""
+    if isinstance(out, np.ndarray):
+        return out.dtype
+    dtype = np.dtype(source.dtype)
+    single = out is not None or (dtype.kind == "f" and dtype.itemsize <= np.dtype("f4").itemsize)
+    return np.dtype(np.float32 if single else np.float64)
 
 
 def _operator(
