@@ -176,21 +176,20 @@ def test_a_killed_server_loses_no_job_and_keeps_no_half_upload(
     And Redis comes back later than the API.
     """
     assert redis_url
-    settings = settings_for(
-        tmp_path, redis_process, orphan_grace_seconds=3, lost_ticket_seconds=0.5
-    )
+    settings = settings_for(tmp_path, redis_process)
+    hasty = settings.model_copy(update={"orphan_grace_seconds": 1, "lost_ticket_seconds": 0.5})
     redis = redis_process.client()
     with api_running(settings, redis_process, tmp_path / "log") as api, api.client() as client:
         good = npy(np.random.default_rng(0).standard_normal((12, 9)))
         job_id = submit(client, {"measurements": ("w.npy", good)}).json()["id"]
-        begin_upload(api, 24)
-        wait_for(lambda: is_storing(api))
-        api.process.send_signal(signal.SIGKILL)
-        api.process.wait()
+        with closing(begin_upload(api, 24)):
+            wait_for(lambda: is_storing(api))
+            api.process.send_signal(signal.SIGKILL)
+            api.process.wait()
         assert is_storing(api)
-        redis.delete("rq:queue:smsr")
+        redis.delete("rq:queue:smsr", "smsr:orphans")
     redis_process.kill()
-    with api_running(settings, redis_process, tmp_path / "log") as api, api.client() as client:
+    with api_running(hasty, redis_process, tmp_path / "log") as api, api.client() as client:
         problem(client.get("/readyz"), "not-ready", 503)  # it starts all the same
         redis_process.start()
         wait_for(lambda: not is_storing(api), seconds=15)
