@@ -32,8 +32,20 @@ if TYPE_CHECKING:
 
     from smsr.metrics import Evaluation
 
-InputFile = Annotated[Path, typer.Argument(exists=True, dir_okay=False, show_default=False)]
-OptionalFile = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, metavar="FILE")]
+Tracks = Annotated[
+    Path,
+    typer.Argument(
+        exists=True,
+        dir_okay=False,
+        metavar="FILE",
+        show_default=False,
+        help="2D tracks: .npy, .npz, .mat, .csv, .txt, ...",
+    ),
+]
+Faces = Annotated[
+    Path | None,
+    typer.Option(exists=True, dir_okay=False, metavar="FILE", help="Triangles of the surface."),
+]
 OptionValues = Annotated[
     list[str] | None,
     typer.Option(
@@ -42,6 +54,9 @@ OptionValues = Annotated[
 ]
 Preset = Annotated[
     str | None, typer.Option(metavar="NAME", help="Short for -O preset=NAME: default or paper.")
+]
+Key = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Name of the array in a file of several.")
 ]
 FrameOfTruth = Annotated[Frame, typer.Option(help="Frame that the ground truth is given in.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -56,20 +71,26 @@ def preset_and_options(
 
 
 def reconstruct(
-    file: InputFile,
-    ground_truth: OptionalFile = None,
-    faces: OptionalFile = None,
+    file: Tracks,
+    ground_truth: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, metavar="FILE", help="True 3D shapes, to measure e3D."
+        ),
+    ] = None,
+    faces: Faces = None,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Folder of the result. [default: FILE-3d]"),
     ] = None,
     preset: Preset = None,
-    key: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The measurements' name within FILE.")
-    ] = None,
-    ground_truth_key: Annotated[str | None, typer.Option(metavar="NAME")] = None,
-    faces_key: Annotated[str | None, typer.Option(metavar="NAME")] = None,
-    frame: FrameOfTruth = "auto",
+    key: Key = None,
+    ground_truth_key: Key = None,
+    faces_key: Key = None,
+    frame: Key = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Name of the array in a file of several.")
+]
+FrameOfTruth = "auto",
     option: OptionValues = None,
     ply: Annotated[bool, typer.Option(help="Write a PLY of every frame.")] = True,
     as_json: AsJson = False,
@@ -113,15 +134,19 @@ def reconstruct(
 
 
 def evaluate(
-    ground_truth: InputFile,
+    ground_truth: Annotated[
+        Path,
+        typer.Argument(exists=True, dir_okay=False, metavar="GROUND_TRUTH", show_default=False),
+    ],
     result: Annotated[
         Path,
         typer.Argument(exists=True, dir_okay=False, show_default=False, metavar="RESULT.npz"),
     ],
-    key: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The ground truth's name within its file.")
-    ] = None,
-    frame: FrameOfTruth = "auto",
+    key: Key = None,
+    frame: Key = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Name of the array in a file of several.")
+]
+FrameOfTruth = "auto",
     as_json: AsJson = False,
 ) -> None:
     """Measure the error of a result against ground truth."""

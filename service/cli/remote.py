@@ -17,7 +17,7 @@ from service.cli.bars import progress_bars, stage_text
 from service.cli.exits import code_of, complain, console, message_of
 from service.cli.local import (
     AsJson,
-    OptionalFile,
+    Faces,
     OptionValues,
     Preset,
     preset_and_options,
@@ -82,7 +82,13 @@ class _Outcome:
 def submit(
     files: Annotated[
         list[Path],
-        typer.Argument(exists=True, dir_okay=False, metavar="FILE...", show_default=False),
+        typer.Argument(
+            exists=True,
+            dir_okay=False,
+            metavar="FILE...",
+            show_default=False,
+            help="2D tracks: .npy, .npz, .mat, .csv, .txt, ...",
+        ),
     ],
     server: Server = LOCAL_SERVER,
     wait: Annotated[
@@ -96,7 +102,7 @@ def submit(
         str | None,
         typer.Option(metavar="FILE", help="{stem} and {file} stand for each FILE's name and path."),
     ] = None,
-    faces: OptionalFile = None,
+    faces: Faces = None,
     preset: Preset = None,
     option: OptionValues = None,
     ply: Annotated[bool, typer.Option(help="Download a PLY of every frame too.")] = True,
