@@ -87,10 +87,7 @@ def reconstruct(
     key: Key = None,
     ground_truth_key: Key = None,
     faces_key: Key = None,
-    frame: Key = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Name of the array in a file of several.")
-]
-FrameOfTruth = "auto",
+    frame: FrameOfTruth = "auto",
     option: OptionValues = None,
     ply: Annotated[bool, typer.Option(help="Write a PLY of every frame.")] = True,
     as_json: AsJson = False,
@@ -143,10 +140,7 @@ def evaluate(
         typer.Argument(exists=True, dir_okay=False, show_default=False, metavar="RESULT.npz"),
     ],
     key: Key = None,
-    frame: Key = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Name of the array in a file of several.")
-]
-FrameOfTruth = "auto",
+    frame: FrameOfTruth = "auto",
     as_json: AsJson = False,
 ) -> None:
     """Measure the error of a result against ground truth."""
