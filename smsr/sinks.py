@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -90,6 +91,7 @@ class FileSink:
         self._shape = (frames, points, 3)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._file = self.path.open("wb")
+        self._lock = Lock()
         try:
             header = {"descr": self.dtype.str, "fortran_order": False, "shape": self._shape}
             np.lib.format.write_array_header_1_0(self._file, header)
@@ -112,7 +114,17 @@ class FileSink:
         _, total, axes = self._shape
         for frame, block in enumerate(shapes):
             position = (frame * total + points.start) * axes * self.dtype.itemsize
-            _write_at(self._file.fileno(), memoryview(block).cast("B"), self._start + position)
+            self._write_at(self._start + position, memoryview(block).cast("B"))
+
+    def _write_at(self, position: int, data: memoryview) -> None:
+        if not hasattr(os, "pwrite"):  # Windows
+            with self._lock:
+                self._file.seek(position)
+                self._file.write(data)
+            return
+        while data:
+            written = os.pwrite(self._file.fileno(), data, position)
+            data, position = data[written:], position + written
 
     def finish(self) -> NDArray[np.floating[Any]]:
         """Close the file and return it as a read-only map."""
@@ -124,12 +136,6 @@ class FileSink:
         """Close and remove the file."""
         self._file.close()
         self.path.unlink(missing_ok=True)
-
-
-def _write_at(descriptor: int, data: memoryview, position: int) -> None:
-    while data:
-        written = os.pwrite(descriptor, data, position)
-        data, position = data[written:], position + written
 
 
 def sink_for(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -15,7 +16,12 @@ if TYPE_CHECKING:
 FLOAT64 = np.dtype(np.float64)
 
 
-def test_ranges_of_points_in_any_order(tmp_path: Path) -> None:
+@pytest.mark.parametrize("positioned", [True, False])
+def test_ranges_of_points_in_any_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, positioned: bool
+) -> None:
+    if not positioned:
+        monkeypatch.delattr(os, "pwrite")
     expected = np.random.default_rng(0).standard_normal((4, 30, 3)).astype(np.float32)
     sink = FileSink(tmp_path, 4, 30)
     for points in (slice(20, 30), slice(0, 7), slice(7, 20)):
