@@ -18,7 +18,7 @@ RULES: dict[str, Any] = yaml.safe_load((DOCKER / "prometheus" / "rules.yml").rea
 def documented() -> dict[str, set[str]]:
     """Metrics of the table in docs/deployment.md, each with its labels."""
     text = (REPOSITORY / "docs" / "deployment.md").read_text()
-    rows = re.findall(r"^\| `(smsr_\w+)` \| (\w+) \| ([^|]*) \|", text, re.MULTILINE)
+    rows = re.findall(r"^\| `(smsr_\w+)` \| (\w+) \|([^|]*)\|", text, re.MULTILINE)
     metrics: dict[str, set[str]] = {}
     for name, kind, labels in rows:
         names = {"histogram": ("_bucket", "_sum", "_count")}.get(kind, ("",))
