@@ -23,7 +23,7 @@ from smsr.files.ply import FACE_BYTES, VERTEX_BYTES, ply_face_block, ply_header
 from worker.storage import ObjectMissing
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
+    from collections.abc import AsyncIterator, Callable, Mapping
 
     from starlette.types import Receive, Scope, Send
 
@@ -110,6 +110,20 @@ class _Cutter:
             yield bytes(piece)
 
 
+class _Kept:
+    """Chunks that are read the first time they are asked for, and kept for the next times."""
+
+    def __init__(self, read: Callable[[], AsyncIterator[bytes]]) -> None:
+        self._read = read
+        self._chunks: list[bytes] | None = None
+
+    async def __call__(self) -> AsyncIterator[bytes]:
+        if self._chunks is None:
+            self._chunks = [chunk async for chunk in self._read()]
+        for chunk in self._chunks:
+            yield chunk
+
+
 @dataclass(frozen=True, slots=True)
 class ResultFiles:
     """The stored files of a finished job.
@@ -190,26 +204,27 @@ class ResultFiles:
         """Yield frame t as a binary little-endian PLY."""
         start = self.shapes.offset + frame * self._vertex_block
         vertices = read_range(self.storage, self.shapes.key, start, self._vertex_block)
-        return self._ply(_Cutter(vertices))
+        return self._ply(_Cutter(vertices), self._face_blocks)
 
     @property
     def _vertex_block(self) -> int:
         return VERTEX_BYTES * self.points
 
-    async def _ply(self, vertices: _Cutter) -> AsyncIterator[bytes]:
+    async def _ply(
+        self, vertices: _Cutter, faces: Callable[[], AsyncIterator[bytes]]
+    ) -> AsyncIterator[bytes]:
         """Yield a PLY with the vertices that come next."""
         yield self._ply_header()
         async for chunk in vertices.cut(self._vertex_block):
             yield chunk
+        async for chunk in faces():
+            yield chunk
+
+    async def _face_blocks(self) -> AsyncIterator[bytes]:
         if self.faces is None:
             return
-        rows = read_range(
-            self.storage,
-            self.faces.key,
-            self.faces.offset,
-            self.faces.size - self.faces.offset,
-        )
-        async for chunk in rows:
+        start, end = self.faces.offset, self.faces.size
+        async for chunk in read_range(self.storage, self.faces.key, start, end - start):
             yield ply_face_block(np.frombuffer(chunk, self.faces.dtype).reshape(-1, 3))
 
     # Archives
@@ -245,10 +260,16 @@ class ResultFiles:
         # An archive is read in order, so one pass over the shapes serves all frames.
         length = self._vertex_block * self.frames
         vertices = _Cutter(read_range(self.storage, self.shapes.key, self.shapes.offset, length))
+        faces = _Kept(self._face_blocks) if self._keeps_faces else self._face_blocks
         return [
-            Member(f"frame_{t:0{digits}d}.ply", size, lambda: self._ply(vertices))
+            Member(f"frame_{t:0{digits}d}.ply", size, lambda: self._ply(vertices, faces))
             for t in range(self.frames)
         ]
+
+    @property
+    def _keeps_faces(self) -> bool:
+        """Whether faces are few enough to be held while an archive is sent."""
+        return FACE_BYTES * self.face_count <= WINDOW_BYTES
 
 
 class OpenResults:

@@ -84,6 +84,7 @@ class JobLinks(BaseModel):
 
     self: str
     cancel: str | None
+    retry: str | None = Field(description="To run a job again that has ended.")
     result: str | None = Field(description="result.npz")
     frames: str | None = Field(description="ZIP of all frames as PLY")
     frame: str | None = Field(description="URI template (RFC 6570) of one frame as PLY, t from 0")
@@ -138,6 +139,7 @@ class Job(BaseModel):
                     "links": {
                         "self": _SELF,
                         "cancel": None,
+                        "retry": f"{_SELF}/retry",
                         "result": f"{_SELF}/result.npz",
                         "frames": f"{_SELF}/frames.zip",
                         "frame": f"{_SELF}/frames/{{t}}.ply",
@@ -312,6 +314,7 @@ def job_document(
         links=JobLinks(
             self=here,
             cancel=f"{here}/cancel" if active else None,
+            retry=None if active else f"{here}/retry",
             result=f"{here}/result.npz" if done else None,
             frames=f"{here}/frames.zip" if done else None,
             frame=f"{here}/frames/{{t}}.ply" if done else None,

@@ -300,9 +300,7 @@ class _Upload:
         """Refuse files that do not fit each other or the options; return T and N where known."""
         self._options = options  # the files may have come first, and be another layout's
         found = {
-            role: self._check(role, file.name, file.bytes)
-            for role, file in self._inputs.items()
-            if role in self._heads
+            role: self._check(role, file.name, file.bytes) for role, file in self._inputs.items()
         }
         measurements = found["measurements"]
         if measurements.shape is None or measurements.dtype is None:

@@ -179,7 +179,7 @@ def test_a_running_job_is_cancelled_and_can_be_run_again(api: Api, client: httpx
     assert asked.status_code == 202
     assert asked.json()["cancel_requested"]
     assert client.get(url, headers={"Prefer": "wait=20"}).json()["status"] == "cancelled"
-    again = client.post(f"{url}/retry")
+    again = client.post(client.get(url).json()["links"]["retry"])
     assert (again.status_code, again.json()["status"]) == (202, "queued")
     problem(client.post(f"{url}/retry"), "job-unfinished", 409)
     assert client.delete(url).status_code == 204
