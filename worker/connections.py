@@ -20,7 +20,7 @@ def _backoff() -> ExponentialWithJitterBackoff:
     return ExponentialWithJitterBackoff(base=0.05, cap=1.0)
 
 
-def connect(url: str, *, patient: bool = False) -> redis.Redis:
+def connect(url: str, *, patient: bool = False, timeout: float = COMMAND_TIMEOUT) -> redis.Redis:
     """Return a client; nothing is sent yet.
 
     Parameters
@@ -30,13 +30,15 @@ def connect(url: str, *, patient: bool = False) -> redis.Redis:
     patient : bool
         Repeat a command for about half a minute while Redis cannot be reached (workers), instead of
         a fraction of a second (the API, which would rather say so).
+    timeout : float
+        Seconds to wait for an answer.
     """
     retry = Retry(_backoff(), PATIENT_RETRIES if patient else BRIEF_RETRIES)
     return redis.Redis.from_url(
         url,
         retry=retry,
-        socket_timeout=COMMAND_TIMEOUT,
-        socket_connect_timeout=CONNECT_TIMEOUT,
+        socket_timeout=timeout,
+        socket_connect_timeout=min(timeout, CONNECT_TIMEOUT),
         health_check_interval=HEALTH_CHECK_INTERVAL,
     )
 

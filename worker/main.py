@@ -29,7 +29,7 @@ from worker.maintenance import Maintenance
 from worker.processes import die_with_parent
 from worker.queue import JobQueue
 from worker.scratch import scratch_folder, sweep_scratch
-from worker.settings import Settings
+from worker.settings import Settings, environment_settings
 from worker.supervisor import Supervisor
 
 if TYPE_CHECKING:
@@ -102,6 +102,8 @@ def _prepare_for_forks(threads: int) -> None:
         os.environ[variable] = str(threads)
     for module in ("worker.task", "smsr.pipeline"):
         importlib.import_module(module)
+    environment_settings.cache_clear()
+    environment_settings()
     gc.collect()
     gc.freeze()
 

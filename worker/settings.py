@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 from pydantic import AliasChoices, Field
@@ -140,3 +141,9 @@ class Settings(BaseSettings):
             for name, value in values.items()
             if value is not None
         }
+
+
+@functools.cache
+def environment_settings() -> Settings:
+    """Return the settings of the environment, read once: work-horses inherit them with the fork."""
+    return Settings()

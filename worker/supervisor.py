@@ -42,8 +42,11 @@ if TYPE_CHECKING:
 WORKER_TTL = 35
 """Seconds RQ waits for a job at a time, plus 15."""
 
-_LIMIT_GRACE = 10.0
-_PUBLISHING_GRACE = 900.0
+BEGIN_GRACE = 60.0
+"""A work-horse that has not begun after this never will."""
+
+LIMIT_GRACE = 10.0
+PUBLISHING_GRACE = 900.0
 """A work-horse past its time limit should have ended by itself after this."""
 
 _OUT_OF_MEMORY_ATTEMPTS = 3
@@ -167,21 +170,24 @@ class Supervisor(Worker):
             return
         hold = self.jobs.records.renew(job_id, worker=self.name, lease=self.settings.lease_seconds)
         if hold.state == "held":
-            watch.attempt = hold.attempt
+            watch.attempt, watch.lost_at = hold.attempt, None
             if watch.limit is None:
                 record = self.jobs.records.get(job_id)
                 asked = record.options.get("time_limit") if record else None
                 watch.limit = self.settings.time_limit(asked)
-            grace = _PUBLISHING_GRACE if hold.stage == "publishing" else _LIMIT_GRACE
+            grace = PUBLISHING_GRACE if hold.stage == "publishing" else LIMIT_GRACE
             if (hold.cancel_seconds or 0.0) > self.settings.cancel_grace_seconds:
                 self._kill(job_id, "it was cancelled")
             elif hold.running_seconds > watch.limit + grace:
                 watch.error = TimeLimitExceeded(watch.limit)
                 self._kill(job_id, "it is over its time limit")
-        elif watch.attempt:
-            # It may be about to notice by itself, or have published and be on its way out.
+        else:
+            # It may not have begun yet, be about to notice by itself that the job is no longer
+            # its own, or have published and be on its way out.
+            not_begun = hold.state == "queued" and not watch.attempt
+            grace = BEGIN_GRACE if not_begun else self.settings.cancel_grace_seconds
             watch.lost_at = watch.lost_at or time.monotonic()
-            if time.monotonic() - watch.lost_at > self.settings.cancel_grace_seconds:
+            if time.monotonic() - watch.lost_at > grace:
                 self._kill(job_id, f"the job is {hold.state}")
 
     def _kill(self, job_id: str, reason: str) -> None:

@@ -39,7 +39,7 @@ from worker.processes import raise_after
 from worker.progress import AttemptOver, ProgressReporter
 from worker.queue import JobQueue
 from worker.records import RecordStore, Verdict, result_prefix
-from worker.settings import Settings
+from worker.settings import environment_settings
 from worker.storage import ObjectMissing, ObjectStorage, StorageError
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from worker.records import JobRecord
+    from worker.settings import Settings
 
 T = TypeVar("T")
 
@@ -56,6 +57,7 @@ SOLVER_SHARE = 0.9
 """Part of the progress bar that is the solver's; evaluating and publishing have the rest."""
 
 _INSIST_SECONDS = 600.0
+_REPORT_TIMEOUT = 1.0
 RESULTS = ("shapes.npy", "cameras.npy", "translations.npy", "faces.npy", "report.json")
 """Objects of a result; faces only where some were given."""
 
@@ -72,23 +74,23 @@ def run(job_id: str) -> None:
     job_id : str
     """
     ticket = get_current_job()
-    settings = Settings()
+    settings = environment_settings()
     if ticket is None or settings.redis_url is None:
         raise RuntimeError("a job runs in a worker only")
-    records = RecordStore(
-        connect(settings.redis_url, patient=True), result_ttl=settings.result_ttl_seconds
-    )
-    attempt = records.begin_attempt(
+    records = RecordStore(ticket.connection, result_ttl=settings.result_ttl_seconds)
+    begin = partial(
+        records.begin_attempt,
         job_id,
         worker=ticket.worker_name or ticket.id,
         ticket=ticket.id,
         lease=settings.lease_seconds,
     )
+    attempt = _insist(begin)
     if attempt is None:
         log.info("nothing to do", job=job_id)
         return
     with structlog.contextvars.bound_contextvars(job=job_id, attempt=attempt):
-        record = records.get(job_id)
+        record = _insist(partial(records.get, job_id))
         if record is not None:
             log.info("attempt began", queued_seconds=_queued_seconds(record))
             _Attempt(settings, records, record, attempt).run()
@@ -104,12 +106,11 @@ class _Attempt:
         self.records = records
         self.record = record
         self.attempt = attempt
-        self.options = parse(JobOptions, record.options)
         self.storage = ObjectStorage(settings.objects_url)
         self.prefix = result_prefix(record.id, attempt)
         self.folder = settings.scratch / f"{record.id}-{attempt}"
         self.report = ProgressReporter(
-            RecordStore(connect(str(settings.redis_url))),
+            RecordStore(connect(str(settings.redis_url), timeout=_REPORT_TIMEOUT)),
             record.id,
             attempt,
             interval=settings.progress_interval_seconds,
@@ -120,15 +121,16 @@ class _Attempt:
 
     def run(self) -> None:
         """Do the work and end the attempt, whatever comes."""
-        limit = self.settings.time_limit(self.options.time_limit)
         try:
+            options = parse(JobOptions, self.record.options)
+            limit = self.settings.time_limit(options.time_limit)
             self.folder.mkdir(parents=True, exist_ok=True)
             with (
                 memory_budget(self.settings.memory_per_job),
                 raise_after(limit, TimeLimitExceeded(limit)),
                 threadpool_limits(self.settings.threads_per_worker),
             ):
-                evaluation = self._compute()
+                evaluation = self._compute(options)
             self._publish(evaluation)
         except AttemptOver as over:
             log.warning("attempt is over", verdict=str(over.verdict))
@@ -152,14 +154,14 @@ class _Attempt:
 
     # The work
 
-    def _compute(self) -> smsr.Evaluation | None:
+    def _compute(self, options: JobOptions) -> smsr.Evaluation | None:
         """Reconstruct into the scratch folder, and compare with ground truth if there is some."""
-        measurements, truth, faces = self._open_inputs()
+        measurements, truth, faces = self._open_inputs(options)
         reconstruction = smsr.reconstruct(
             measurements,
             out=self.folder,
             progress=self._solver_progress,
-            options=self.options.solver_options(),
+            options=options.solver_options(),
         )
         self.timings |= reconstruction.diagnostics.seconds
         if faces is not None:
@@ -168,29 +170,27 @@ class _Attempt:
             return None
         self._stage("evaluating", SOLVER_SHARE)
         started = time.perf_counter()
-        evaluation = smsr.evaluate(truth, reconstruction, frame=self.options.ground_truth_frame)
+        evaluation = smsr.evaluate(truth, reconstruction, frame=options.ground_truth_frame)
         self.timings["evaluating"] = time.perf_counter() - started
         return evaluation
 
     def _open_inputs(
-        self,
+        self, options: JobOptions
     ) -> tuple[smsr.measurements.MeasurementSource, NDArray[Any] | None, NDArray[Any] | None]:
         """Open all inputs and check them against each other before the long work begins."""
         self._stage("opening", 0.0)
         started = time.perf_counter()
-        source = as_source(
-            self._open("measurements", self.options.measurements_key), self.options.layout
-        )
+        source = as_source(self._open("measurements", options.measurements_key), options.layout)
         self.report.set_size(source.frames, source.points)
         truth = faces = None
         if "ground_truth" in self.record.inputs:
-            truth = self._open("ground_truth", self.options.ground_truth_key)
+            truth = self._open("ground_truth", options.ground_truth_key)
             as_shapes(truth, source.frames, source.points)
         if "faces" in self.record.inputs:
             faces = load_faces(
                 self._local("faces"),
                 source.points,
-                key=self.options.faces_key,
+                key=options.faces_key,
                 limit=self.settings.max_array_bytes,
                 name=self.record.inputs["faces"].name,
             )

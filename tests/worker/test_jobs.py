@@ -322,7 +322,7 @@ def test_deleting_a_running_job(queue: JobQueue, submit: Submitter, start_worker
     assert list(queue.storage.list_prefix("results/")) == []
 
 
-@pytest.mark.parametrize("kind", ["slow", "stuck"])
+@pytest.mark.parametrize("kind", ["slow", "stuck", "deaf"])
 def test_the_time_limit(
     queue: JobQueue, submit: Submitter, start_worker: Workers, kind: Any
 ) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import worker.supervisor
 from worker.logs import configure_logging
 from worker.main import run_worker
 from worker.progress import ProgressReporter
@@ -20,11 +22,12 @@ if TYPE_CHECKING:
 class Behaviour:
     """What a worker does when it has reported a stage.
 
-    `slow` goes on reporting, `stuck` does not, `greedy` finds no memory, `broken` has a bug.
+    `slow` goes on reporting, `stuck` does not, `deaf` is stuck in a library call that no Python
+    signal handler can interrupt, `greedy` finds no memory, `broken` has a bug.
     """
 
     stage: str
-    kind: Literal["slow", "stuck", "greedy", "broken"] = "slow"
+    kind: Literal["slow", "stuck", "deaf", "greedy", "broken"] = "slow"
     attempts: int = 1
     seconds: float = 60.0
 
@@ -38,6 +41,7 @@ def work(settings: Settings, behaviour: Behaviour | None) -> None:
 
 
 def _misbehave(behaviour: Behaviour) -> None:
+    worker.supervisor.LIMIT_GRACE = 0.5
     report = ProgressReporter.__call__
 
     def misbehaving(self: ProgressReporter, progress: Progress) -> bool:
@@ -47,9 +51,11 @@ def _misbehave(behaviour: Behaviour) -> None:
                 raise MemoryError
             if behaviour.kind == "broken":
                 raise ZeroDivisionError("a bug")
+            if behaviour.kind == "deaf":
+                signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
             end = time.monotonic() + behaviour.seconds
             while going_on and time.monotonic() < end:
-                time.sleep(behaviour.seconds if behaviour.kind == "stuck" else 0.05)
+                time.sleep(0.05 if behaviour.kind == "slow" else behaviour.seconds)
                 going_on = report(self, progress)
         return going_on
 
