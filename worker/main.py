@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 from redis.exceptions import RedisError
+from threadpoolctl import threadpool_limits
 
 from worker.connections import connect
 from worker.logs import configure_logging
@@ -102,6 +103,8 @@ def _prepare_for_forks(threads: int) -> None:
         os.environ[variable] = str(threads)
     for module in ("worker.task", "smsr.pipeline"):
         importlib.import_module(module)
+    # Here, for all of them: to look for the loaded libraries takes longer than a small job.
+    threadpool_limits(threads)
     environment_settings.cache_clear()
     environment_settings()
     gc.collect()

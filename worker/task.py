@@ -15,7 +15,6 @@ import numpy as np
 import structlog
 from redis.exceptions import RedisError
 from rq import get_current_job
-from threadpoolctl import threadpool_limits
 
 import smsr
 from smsr.errors import Cancelled, SmsrError
@@ -128,7 +127,6 @@ class _Attempt:
             with (
                 memory_budget(self.settings.memory_per_job),
                 raise_after(limit, TimeLimitExceeded(limit)),
-                threadpool_limits(self.settings.threads_per_worker),
             ):
                 evaluation = self._compute(options)
             self._publish(evaluation)

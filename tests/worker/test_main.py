@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+from tests.conftest import clean_environment
+
+if TYPE_CHECKING:
+    from tests.worker.conftest import Submitter
+    from worker.queue import JobQueue
+    from worker.records import JobRecord
+    from worker.settings import Settings
+
+THREADS = """
+import os
+from threadpoolctl import threadpool_info
+from worker.main import _prepare_for_forks
+_prepare_for_forks(1)
+if os.fork() == 0:
+    import numpy as np
+    np.ones((300, 300)) @ np.ones((300, 300))
+    print(sorted({library["num_threads"] for library in threadpool_info()}), flush=True)
+    os._exit(0)
+os.wait()
+"""
+
+
+def test_a_worker_that_ends_when_the_queue_is_empty(
+    queue: JobQueue, settings: Settings, submit: Submitter
+) -> None:
+    jobs = [submit() for _ in range(2)]
+    subprocess.run(
+        [sys.executable, "-m", "worker.main", "--burst"],
+        env=clean_environment(**settings.to_environ()),
+        check=True,
+        timeout=120,
+    )
+    assert [state(queue.records.get(job_id)) for job_id in jobs] == ["succeeded"] * 2
+    assert queue.workers() == 0
+    assert list(settings.scratch.iterdir()) == []
+
+
+def state(record: JobRecord | None) -> str | None:
+    return record.status if record else None
+
+
+def test_work_horses_inherit_the_number_of_threads() -> None:
+    environment = {k: v for k, v in clean_environment().items() if not k.endswith("NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", THREADS],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == "[1]"
