@@ -12,7 +12,7 @@ from smsr.progress import Progress, ProgressCallback
 if TYPE_CHECKING:
     from smsr.metrics import Evaluation, evaluate
     from smsr.pipeline import STAGES, reconstruct
-    from smsr.result import Diagnostics, Reconstruction
+    from smsr.result import Diagnostics, MovingSurface, Reconstruction
 
 __version__ = "0.1.0"
 
@@ -20,6 +20,7 @@ __all__ = [
     "STAGES",
     "Diagnostics",
     "Evaluation",
+    "MovingSurface",
     "Options",
     "Progress",
     "ProgressCallback",
@@ -37,6 +38,7 @@ _LOADED_LATER = {
     "Evaluation": "smsr.metrics",
     "evaluate": "smsr.metrics",
     "Diagnostics": "smsr.result",
+    "MovingSurface": "smsr.result",
     "Reconstruction": "smsr.result",
 }
 

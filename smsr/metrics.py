@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from smsr.result import Reconstruction
+    from smsr.result import MovingSurface
 
 Frame: TypeAlias = Literal["auto", "camera", "object"]
 
@@ -88,7 +88,7 @@ class Evaluation:
 
 
 def evaluate(
-    ground_truth: ArrayLike, reconstruction: Reconstruction, *, frame: Frame = "auto"
+    ground_truth: ArrayLike, reconstruction: MovingSurface, *, frame: Frame = "auto"
 ) -> Evaluation:
     """Compare a reconstruction with ground truth.
 
@@ -97,8 +97,8 @@ def evaluate(
     ground_truth : array-like of shape (3T, N), (T, N, 3) or (T, 3, N)
         True points, in any order of points that agrees with the measurements. Rows of the first
         form are x1, y1, z1, x2, ...
-    reconstruction : Reconstruction
-        What `smsr.reconstruct` returned.
+    reconstruction : MovingSurface
+        What `smsr.reconstruct` returned or `smsr.files.open_result` opened.
     frame : {"auto", "camera", "object"}
         Whether the ground truth is given in the frame of the moving camera, so that one fixed
         camera maps every frame of it to the image (its x and y rows are the centred measurements,

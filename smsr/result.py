@@ -105,7 +105,7 @@ class Diagnostics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reconstruction:
+class MovingSurface:
     """A moving 3D surface and the camera that saw it: ``W_t = R_t S_t + t_t``.
 
     Attributes
@@ -118,14 +118,11 @@ class Reconstruction:
         R: orthonormal rows of the orthographic camera of each frame.
     translations : ndarray of shape (T, 2), float64, read-only
         t: image position of the shape's centroid.
-    diagnostics : Diagnostics
-        How it came about.
     """
 
     shapes: NDArray[np.floating[Any]]
     cameras: NDArray[np.float64]
     translations: NDArray[np.float64]
-    diagnostics: Diagnostics
 
     def __post_init__(self) -> None:
         for array in (self.shapes, self.cameras, self.translations):
@@ -143,3 +140,16 @@ class Reconstruction:
         rotations = self.rotations.astype(self.shapes.dtype)
         turned: NDArray[np.floating[Any]] = self.shapes @ rotations.transpose(0, 2, 1)
         return turned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction(MovingSurface):
+    """The surface that a run found, and how.
+
+    Attributes
+    ----------
+    diagnostics : Diagnostics
+        How it came about.
+    """
+
+    diagnostics: Diagnostics

@@ -17,11 +17,10 @@ from service.cli import option_values
 from service.cli.bars import SolverBar, progress_bars
 from service.cli.exits import console, errors
 from smsr.errors import InputError
-from smsr.files import load_faces, open_array, write_npz, write_ply
+from smsr.files import load_faces, open_array, open_result, write_npz, write_ply
 from smsr.measurements import as_source
 from smsr.metrics import Frame, as_shapes
 from smsr.options import OptionDescription, Options, describe, parse
-from smsr.result import Diagnostics, Reconstruction
 from smsr.synthetic import write_example
 from worker.options import JobOptions
 
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smsr.metrics import Evaluation
+    from smsr.result import Diagnostics, Reconstruction
 
 Tracks = Annotated[
     Path,
@@ -147,7 +147,7 @@ def evaluate(
     with _naming(ground_truth):
         truth = open_array(ground_truth, key=key, role="ground_truth")
     with _naming(result):
-        found = _read_result(result)
+        found = open_result(result)
     error = smsr.evaluate(truth, found, frame=frame)
     if as_json:
         console.print_json(data=error.to_dict())
@@ -243,27 +243,6 @@ def _write(
         (target / "frames").mkdir(exist_ok=True)
         for t, shape in enumerate(result.shapes):
             write_ply(target / "frames" / f"frame_{t:04d}.ply", shape, faces)
-
-
-def _read_result(path: Path) -> Reconstruction:
-    """Open a result.npz; how it came about is not in it."""
-    # Under a key that is named, an array of any shape is opened.
-    shapes, cameras, translations = (
-        open_array(path, key=name, role="ground_truth")
-        for name in ("shapes", "cameras", "translations")
-    )
-    unknown = Diagnostics(
-        options=Options(),
-        frames=shapes.shape[0],
-        points=shapes.shape[1],
-        basis_size=0,
-        camera_model="unknown",
-        camera_reason="read from a file",
-        converged=True,
-        stages=(),
-        singular_values=(),
-    )
-    return Reconstruction(shapes, cameras, translations, unknown)
 
 
 def _tell(target: Path, found: Diagnostics, error: Evaluation | None) -> None:

@@ -7,6 +7,7 @@ from smsr.files.npz import write_npz
 from smsr.files.opening import DEFAULT_LIMIT, open_array
 from smsr.files.ply import ply_face_block, ply_header, write_ply
 from smsr.files.prefix import Beginning, check_prefix
+from smsr.files.results import open_result
 from smsr.files.selection import Role
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "load_faces",
     "npy_header",
     "open_array",
+    "open_result",
     "ply_face_block",
     "ply_header",
     "sniff",
