@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from service.client import ClientError, ServerUnreachable, ServiceError
 from smsr.benchmark import BenchmarkFailed
-from smsr.errors import InputError, InvalidOption, SmsrError, UnknownOption
+from smsr.errors import Cancelled, InputError, InvalidOption, SmsrError, UnknownOption
 
 
 class ExitCode(enum.IntEnum):
@@ -48,6 +48,8 @@ def complain(message: str) -> None:
 def code_of(error: Exception) -> ExitCode:
     """Return the exit code of an expected error."""
     match error:
+        case Cancelled():
+            return ExitCode.INTERRUPTED
         case UnknownOption() | InvalidOption():
             return ExitCode.USAGE
         case InputError():

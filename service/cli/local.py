@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
 import tempfile
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,10 +28,12 @@ from worker.options import JobOptions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from types import FrameType
 
     from numpy.typing import NDArray
 
     from smsr.metrics import Evaluation
+    from smsr.progress import Progress, ProgressCallback
     from smsr.result import Diagnostics, Reconstruction
 
 Tracks = Annotated[
@@ -118,7 +122,8 @@ def reconstruct(
         progress_bars() as bars,
     ):
         bar = SolverBar(bars, file.name)
-        result = smsr.reconstruct(source, out=scratch, progress=bar, options=options)
+        with _stop_at_interrupt(bar) as progress:
+            result = smsr.reconstruct(source, out=scratch, progress=progress, options=options)
         bar.finish()
         error = None if truth is None else smsr.evaluate(truth, result, frame=frame)
         report = result.diagnostics.to_dict()
@@ -222,6 +227,31 @@ def _naming(file: Path) -> Iterator[None]:
         yield
     except InputError as error:
         raise type(error)(f"{file}: {error.detail}", **error.context) from error
+
+
+@contextlib.contextmanager
+def _stop_at_interrupt(bar: SolverBar) -> Iterator[ProgressCallback]:
+    """Cancel the run at the first interrupt, in order; a second one is raised at once.
+
+    Python drops an exception that a signal raises while a callback of C code runs, and a run takes
+    long: it must not miss the only one.
+    """
+    interrupted = threading.Event()
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        if interrupted.is_set():
+            signal.default_int_handler(signum, frame)
+        interrupted.set()
+
+    def report(progress: Progress) -> bool:
+        bar(progress)
+        return not interrupted.is_set()
+
+    former = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield report
+    finally:
+        signal.signal(signal.SIGINT, former)
 
 
 def _write(
