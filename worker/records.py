@@ -17,6 +17,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast, get_args
 
 from smsr.progress import Progress
+from worker import counters
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,8 +32,11 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 FINAL: tuple[Status, ...] = ("succeeded", "failed", "cancelled")
 
 _DOCUMENTS = ("options", "inputs", "progress", "metrics", "timings", "problem")
+_NO_STAGES = ("queued", "total")
 _PAGE_LIMIT = 1000
-_SCRIPT = resources.files("worker").joinpath("transitions.lua").read_text(encoding="utf-8")
+_SCRIPT = counters.LUA + (
+    resources.files("worker").joinpath("transitions.lua").read_text(encoding="utf-8")
+)
 _WORKERS = f"{PREFIX}:workers"
 """Sorted set of the names of worker processes by their last sign of life."""
 
@@ -168,6 +172,24 @@ class Page:
 
     records: tuple[JobRecord, ...]
     next_cursor: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """The whole queue at one moment.
+
+    Attributes
+    ----------
+    jobs : dict of str to int
+        Records by status.
+    workers : int
+        Worker processes that live.
+    counters : Counters
+    """
+
+    jobs: Mapping[Status, int]
+    workers: int
+    counters: counters.Counters
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,6 +335,28 @@ class RecordStore:
             for status in STATUSES:
                 pipe.zcard(_index(status, owner))
             return dict(zip(STATUSES, pipe.execute(), strict=True))
+
+    def survey(self, seconds: float) -> Survey:
+        """Return all that is counted, in one round trip.
+
+        Parameters
+        ----------
+        seconds : float
+            Workers that gave no sign of life for longer are dead.
+        """
+        with self.redis.pipeline() as pipe:
+            pipe.time()
+            pipe.zrange(_WORKERS, 0, -1, withscores=True)
+            pipe.hgetall(f"{PREFIX}:counters")
+            for status in STATUSES:
+                pipe.zcard(_index(status, None))
+            (now, microseconds), workers, counted, *jobs = pipe.execute()
+        since = now + microseconds / 1e6 - seconds
+        return Survey(
+            dict(zip(STATUSES, jobs, strict=True)),
+            sum(seen >= since for _, seen in workers),
+            counters.decode(counted),
+        )
 
     def expired(self, limit: int = 100) -> Sequence[str]:
         """Return ids of jobs whose time to live has passed."""
@@ -469,12 +513,22 @@ class RecordStore:
         fields += ["progress", _encode(dataclasses.asdict(Progress("done", 1.0)))]
         if metrics is not None:
             fields += ["metrics", _encode(metrics)]
-        prefix = result_prefix(job_id, attempt)
-        return self._verdict("publish", job_id, attempt, prefix, self.result_ttl, *fields)
+        stages = {name: s for name, s in timings.items() if name not in _NO_STAGES}
+        return self._verdict(
+            "publish",
+            job_id,
+            attempt,
+            result_prefix(job_id, attempt),
+            self.result_ttl,
+            _encode(stages),
+            *fields,
+        )
 
     def fail(self, job_id: str, attempt: int, problem: Mapping[str, Any]) -> Verdict:
         """End a job with a problem document."""
-        return self._verdict("fail", job_id, attempt, _encode(problem), self.result_ttl)
+        return self._verdict(
+            "fail", job_id, attempt, _encode(problem), _slug(problem), self.result_ttl
+        )
 
     def stop(self, job_id: str, attempt: int) -> Verdict:
         """End a job that was asked to stop; CANCELLED when it has ended so."""
@@ -506,7 +560,14 @@ class RecordStore:
         problem : mapping
         """
         outcome = self._step(
-            "release", job_id, holder, int(lost), max_attempts, _encode(problem), self.result_ttl
+            "release",
+            job_id,
+            holder,
+            int(lost),
+            max_attempts,
+            _encode(problem),
+            _slug(problem),
+            self.result_ttl,
         )
         return cast("Literal['queued']", outcome.decode())
 
@@ -520,7 +581,8 @@ class RecordStore:
         A job is taken at the second look, `grace` seconds or more after the first one that found
         its lease to have run out.
         """
-        flat = self._step("expire", "*", grace, max_attempts, _encode(problem), self.result_ttl)
+        ending = (_encode(problem), _slug(problem), self.result_ttl)
+        flat = self._step("expire", "*", grace, max_attempts, *ending)
         texts = [part.decode() for part in flat]
         return dict(zip(texts[::2], texts[1::2], strict=True))
 
@@ -571,6 +633,10 @@ def decode(job_id: str, found: Mapping[bytes, bytes]) -> JobRecord | None:
 
 def _encode(document: object) -> str:
     return json.dumps(document, allow_nan=False, separators=(",", ":"))
+
+
+def _slug(problem: Mapping[str, Any]) -> str:
+    return str(problem.get("type", "unknown")).rpartition("/")[2]
 
 
 def _index(status: Status | None, owner: str | None) -> str:

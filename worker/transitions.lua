@@ -10,6 +10,8 @@
 --   leases                       sorted set of running ids by the end of their lease
 --   expiry                       sorted set of finished ids by the end of their time to live
 --   garbage                      sorted set of storage prefixes by the time they are to be removed
+--   counters                     hash: counts of all jobs (`worker.counters`, which also gives the
+--                                `bounds` of histograms and the `sizes` of jobs used here)
 --   changed:{id}                 channel: the record's version at every visible change
 --
 -- `attempt` is a fencing token: it grows with every start of the job, and only the holder of the
@@ -21,6 +23,7 @@ redis.replicate_commands() -- Redis 6 needs it to write after TIME; later ones d
 local prefix, step, id = KEYS[1] .. ':', ARGV[1], ARGV[2]
 local record = prefix .. 'job:' .. id
 local leases, expiry, garbage = prefix .. 'leases', prefix .. 'expiry', prefix .. 'garbage'
+local counters = prefix .. 'counters'
 
 local time = redis.call('TIME')
 local now = tonumber(time[1]) + tonumber(time[2]) / 1e6
@@ -64,9 +67,43 @@ local function discard_results(job, first, last)
   end
 end
 
+local function count(name)
+  redis.call('HINCRBY', counters, name, 1)
+end
+
+-- Counts seconds into the histogram of a name.
+local function observe(name, seconds)
+  seconds = math.max(0, seconds)
+  local bucket = 'inf'
+  for _, bound in ipairs(bounds) do
+    if seconds <= tonumber(bound) then
+      bucket = bound
+      break
+    end
+  end
+  count(name .. ':' .. bucket)
+  redis.call('HINCRBYFLOAT', counters, name .. ':sum', stamp(seconds))
+end
+
+local function size_of(key)
+  local frames, points = unpack(redis.call('HMGET', key, 'frames', 'points'))
+  if frames and points then
+    for _, size in ipairs(sizes) do
+      if frames * points < size[2] then
+        return size[1]
+      end
+    end
+  end
+  return 'unknown'
+end
+
 -- Ends a job; a time to live of 0 keeps it for ever.
 local function finish(job, status, ttl)
   local key = prefix .. 'job:' .. job
+  count('ended:' .. status)
+  if read(key, 'status') == 'running' then
+    observe('run:' .. size_of(key), now - read(key, 'started_at'))
+  end
   redis.call('ZREM', leases, job)
   redis.call('HDEL', key, 'worker', 'suspected_at', 'cancel_requested_at')
   redis.call('HSET', key, 'finished_at', stamp(now))
@@ -78,9 +115,15 @@ local function finish(job, status, ttl)
   changed(job)
 end
 
+local function fail(job, problem, slug, ttl)
+  redis.call('HSET', prefix .. 'job:' .. job, 'problem', problem)
+  count('failed:' .. slug)
+  finish(job, 'failed', ttl)
+end
+
 -- Takes a running job from its worker: queued again, or ended where it was cancelled or lost too
 -- often. Returns what became of it.
-local function take_back(job, counts, max_attempts, problem, ttl)
+local function take_back(job, counts, max_attempts, problem, slug, ttl)
   local key = prefix .. 'job:' .. job
   local attempt = tonumber(read(key, 'attempt'))
   discard_results(job, attempt, attempt)
@@ -90,13 +133,14 @@ local function take_back(job, counts, max_attempts, problem, ttl)
     return 'cancelled'
   end
   local lost = redis.call('HINCRBY', key, 'lost_attempts', counts)
+  redis.call('HINCRBY', counters, 'lost', counts)
   if lost >= tonumber(max_attempts) then
-    redis.call('HSET', key, 'problem', problem)
-    finish(job, 'failed', ttl)
+    fail(job, problem, slug, ttl)
     return 'failed'
   end
   redis.call('ZREM', leases, job)
   redis.call('HDEL', key, 'worker', 'suspected_at', 'progress')
+  redis.call('HSET', key, 'queued_at', stamp(now))
   set_status(job, 'queued')
   changed(job)
   return 'queued'
@@ -130,8 +174,9 @@ function steps.create(owner, nonce, ...)
   if known then
     return known == nonce and 'ok' or 'exists'
   end
-  redis.call('HSET', record, 'status', 'queued', 'created_at', stamp(now), 'owner', owner,
-    'nonce', nonce, 'attempt', 0, 'lost_attempts', 0, ...)
+  redis.call('HSET', record, 'status', 'queued', 'created_at', stamp(now),
+    'queued_at', stamp(now), 'owner', owner, 'nonce', nonce, 'attempt', 0, 'lost_attempts', 0,
+    ...)
   for _, status in ipairs({ '', ':queued' }) do
     for _, index in ipairs(indices(owner, status)) do
       redis.call('ZADD', index, stamp(now), id)
@@ -168,6 +213,7 @@ function steps.begin(worker, ticket, lease)
     return { 'finished' }
   end
   local attempt = redis.call('HINCRBY', record, 'attempt', 1)
+  observe('wait', now - (read(record, 'queued_at') or read(record, 'created_at')))
   redis.call('HDEL', record, 'progress', 'suspected_at', 'missing_since')
   redis.call('HSET', record, 'worker', worker, 'held_by', ticket, 'started_at', stamp(now))
   redis.call('ZADD', leases, stamp(now + lease), id)
@@ -208,30 +254,32 @@ function steps.progress(attempt, progress, lease, frames, points)
   return answer
 end
 
--- attempt, result prefix, ttl, then field, value, ... -> verdict
-function steps.publish(attempt, result_prefix, ttl, ...)
+-- attempt, result prefix, ttl, seconds by stage (JSON), then field, value, ... -> verdict
+function steps.publish(attempt, result_prefix, ttl, stages, ...)
   if read(record, 'status') == 'succeeded' and read(record, 'attempt') == attempt then
     return 'ok'
   end
   local answer = verdict(attempt)
   if answer == 'ok' then
     redis.call('HSET', record, 'result_prefix', result_prefix, ...)
+    for stage, seconds in pairs(cjson.decode(stages)) do
+      observe('stage:' .. stage, seconds)
+    end
     discard_results(id, 1, attempt - 1)
     finish(id, 'succeeded', ttl)
   end
   return answer
 end
 
--- attempt, problem, ttl -> verdict; a job whose cancellation was asked for ends cancelled
-function steps.fail(attempt, problem, ttl)
+-- attempt, problem, its slug, ttl -> verdict; a job whose cancellation was asked for ends cancelled
+function steps.fail(attempt, problem, slug, ttl)
   if read(record, 'status') == 'failed' and read(record, 'attempt') == attempt then
     return 'ok'
   end
   local answer = verdict(attempt)
   if answer == 'ok' then
-    redis.call('HSET', record, 'problem', problem)
     discard_results(id, 1, attempt)
-    finish(id, 'failed', ttl)
+    fail(id, problem, slug, ttl)
   end
   return answer
 end
@@ -251,8 +299,8 @@ function steps.stop(attempt, ttl)
 end
 
 -- attempt or worker name, 1 if it counts as a loss, max attempts, problem when there were too many,
--- ttl -> 'queued' | 'failed' | 'cancelled' | 'lost' | 'gone'
-function steps.release(holder, counts, max_attempts, problem, ttl)
+-- its slug, ttl -> 'queued' | 'failed' | 'cancelled' | 'lost' | 'gone'
+function steps.release(holder, counts, max_attempts, problem, slug, ttl)
   local status = read(record, 'status')
   if not status then
     return 'gone'
@@ -261,13 +309,13 @@ function steps.release(holder, counts, max_attempts, problem, ttl)
     or (read(record, 'attempt') ~= holder and read(record, 'worker') ~= holder) then
     return 'lost'
   end
-  return take_back(id, counts, max_attempts, problem, ttl)
+  return take_back(id, counts, max_attempts, problem, slug, ttl)
 end
 
--- id is '*'; grace seconds, max attempts, problem, ttl -> {id, outcome, ...}
+-- id is '*'; grace seconds, max attempts, problem, its slug, ttl -> {id, outcome, ...}
 -- A lease that ran out is suspected at first and taken at a later look, so that workers that only
 -- could not reach Redis (a restart, a suspended machine) have time to come back.
-function steps.expire(grace, max_attempts, problem, ttl)
+function steps.expire(grace, max_attempts, problem, slug, ttl)
   local outcome = {}
   local silent = redis.call('ZRANGEBYSCORE', leases, '-inf', stamp(now), 'LIMIT', 0, 100)
   for _, job in ipairs(silent) do
@@ -279,7 +327,7 @@ function steps.expire(grace, max_attempts, problem, ttl)
       redis.call('HSET', key, 'suspected_at', stamp(now))
     elseif now - suspected >= tonumber(grace) then
       outcome[#outcome + 1] = job
-      outcome[#outcome + 1] = take_back(job, 1, max_attempts, problem, ttl)
+      outcome[#outcome + 1] = take_back(job, 1, max_attempts, problem, slug, ttl)
     end
   end
   return outcome
@@ -339,7 +387,7 @@ function steps.retry()
   discard_results(id, 1, tonumber(read(record, 'attempt')))
   redis.call('HDEL', record, 'problem', 'metrics', 'timings', 'result_prefix', 'progress',
     'started_at', 'finished_at', 'expires_at')
-  redis.call('HSET', record, 'lost_attempts', 0)
+  redis.call('HSET', record, 'lost_attempts', 0, 'queued_at', stamp(now))
   redis.call('ZREM', expiry, id)
   set_status(id, 'queued')
   changed(id)

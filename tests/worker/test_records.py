@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
@@ -56,7 +57,9 @@ def begun(store: RecordStore, job_id: str, worker: str = "ann", ticket: str = "t
 
 
 def published(store: RecordStore, job_id: str, attempt: int) -> Verdict:
-    return store.publish(job_id, attempt, frames=3, points=4, timings={"total": 1.5})
+    return store.publish(
+        job_id, attempt, frames=3, points=4, timings={"cameras": 0.5, "total": 1.5}
+    )
 
 
 def got(store: RecordStore, job_id: str) -> JobRecord:
@@ -282,15 +285,16 @@ def test_only_expired_jobs_are_deleted_when_asked_so(store: RecordStore) -> None
     assert store.expired() == []
 
 
-def test_deleting_leaves_only_the_list_of_garbage(store: RecordStore) -> None:
+def test_deleting_leaves_only_the_list_of_garbage_and_the_counts(store: RecordStore) -> None:
     job_id = created(store, owner="ann")
     published(store, job_id, begun(store, job_id))
     assert store.delete(job_id) == ("ok", "")
-    assert store.redis.keys("*") == [f"{PREFIX}:garbage".encode()]
+    counters = f"{PREFIX}:counters".encode()
+    assert set(store.redis.keys("*")) == {counters, f"{PREFIX}:garbage".encode()}
     assert set(store.garbage()) == {f"uploads/{job_id}/", f"results/{job_id}/"}
     for prefix in store.garbage():
         store.forget_garbage(prefix)
-    assert store.redis.keys("*") == []
+    assert store.redis.keys("*") == [counters]
 
 
 def test_a_silent_worker_loses_its_job_at_the_second_look(store: RecordStore) -> None:
@@ -400,6 +404,7 @@ class Lives(RuleBasedStateMachine):
         self.ended: dict[str, tuple[str, int]] = {}
         self.asked: set[str] = set()
         self.ticket = 0
+        self.counted: Counter[str] = Counter()
 
     @rule(slot=SLOTS, worker=WORKERS)
     def begin(self, slot: int, worker: str) -> None:
@@ -412,6 +417,7 @@ class Lives(RuleBasedStateMachine):
             assert job not in self.running
             assert job not in self.ended
             self.running[job] = attempt
+            self.counted["begun"] += 1
 
     def which(self, slot: int, behind: int) -> tuple[str, int]:
         job = self.jobs[slot]
@@ -426,6 +432,8 @@ class Lives(RuleBasedStateMachine):
         del self.running[job]
         self.asked.discard(job)
         self.ended[job] = (status, attempt)
+        self.counted[status] += 1
+        self.counted["run"] += 1
 
     @rule(slot=SLOTS, behind=BEHIND)
     def report(self, slot: int, behind: int) -> None:
@@ -501,6 +509,7 @@ class Lives(RuleBasedStateMachine):
         else:
             assert outcome == "cancelled"
             self.ended[job] = ("cancelled", record.attempt)
+            self.counted["cancelled"] += 1
 
     @rule(slot=SLOTS)
     def retry(self, slot: int) -> None:
@@ -548,6 +557,16 @@ class Lives(RuleBasedStateMachine):
             assert self.redis.zscore(f"{PREFIX}:leases", job) is not None
 
     @invariant()
+    def each_end_and_each_start_is_counted_once(self) -> None:
+        counters = self.store.survey(60).counters
+        assert counters.ended == {s: n for s, n in self.counted.items() if s in FINAL}
+        assert sum(counters.failures.values()) == self.counted["failed"]
+        assert counters.waits.count == self.counted["begun"]
+        assert sum(runs.count for runs in counters.runs.values()) == self.counted["run"]
+        stages = [stage.count for stage in counters.stages.values()]
+        assert stages == [self.counted["succeeded"]] * len(stages)
+
+    @invariant()
     def published_results_are_no_garbage(self) -> None:
         garbage = set(self.store.garbage(10_000))
         for record in self.store.list("succeeded", limit=1000).records:
@@ -560,8 +579,8 @@ def test_no_order_of_steps_breaks_a_record(redis_process: RedisProcess) -> None:
     run_machine(
         Lives,
         settings=settings(
-            max_examples=50,
-            stateful_step_count=25,
+            max_examples=30,
+            stateful_step_count=20,
             deadline=None,
             phases=[Phase.reuse, Phase.generate],  # shrinking takes minutes
             suppress_health_check=list(HealthCheck),
