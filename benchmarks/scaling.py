@@ -186,9 +186,10 @@ def table(rows: list[Row], threads: int) -> str:
     for row in rows:
         quiet = row.quiet.requests / row.quiet.seconds
         per_job = (row.busy.requests - quiet * row.busy.seconds) / row.jobs
+        redis_share = row.busy.processor / row.busy.seconds
         lines.append(
             f"| {row.workers} | {row.jobs_per_second:.2f} | {row.run_seconds:.2f} "
-            f"| {row.cores:.2f} | {quiet:.1f} | {per_job:.0f} | {row.busy.processor / row.busy.seconds:.1%} |"
+            f"| {row.cores:.2f} | {quiet:.1f} | {per_job:.0f} | {redis_share:.1%} |"
         )
     return "\n".join(lines)
 
