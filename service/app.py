@@ -17,7 +17,8 @@ from service import problems
 from service.context import Context
 from service.downloads import OpenResults
 from service.lingering import LingeringClose
-from service.routes import health, info, jobs, results
+from service.metrics import MeasuredRequests, Metrics
+from service.routes import health, info, jobs, metrics, results
 from service.routes import problems as problem_pages
 from worker.changes import ChangeFeed
 from worker.connections import connect_async
@@ -64,12 +65,14 @@ def create_app(settings: Settings) -> FastAPI:
     if settings.redis_url is None:
         raise ValueError("the service needs the address of a Redis server")
     redis_url = settings.redis_url
+    measured = Metrics(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         queue = JobQueue(settings)
         async with connect_async(redis_url) as redis, ChangeFeed(redis) as feed:
-            app.state.context = Context(settings, queue, feed, OpenResults(queue.storage))
+            opened = OpenResults(queue.storage)
+            app.state.context = Context(settings, queue, feed, opened, measured)
             keeper = asyncio.create_task(_keep_order(queue), name="maintenance")
             try:
                 yield
@@ -78,6 +81,7 @@ def create_app(settings: Settings) -> FastAPI:
                 with suppress(asyncio.CancelledError):
                     await keeper
                 queue.redis.close()
+                measured.close()
 
     app = FastAPIOffline(
         redoc_url=None,
@@ -96,10 +100,15 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.router.redirect_slashes = False
     problems.install(app)
-    for routes in (jobs, results, info, health, problem_pages):
+    for routes in (jobs, results, info, health, metrics, problem_pages):
         app.include_router(routes.router)
         app.include_router(_heads_of(routes.router))
     app.add_middleware(NoSniff)
+    app.add_middleware(
+        MeasuredRequests,
+        metrics=measured.requests,
+        results={route.path for route in results.router.routes if isinstance(route, APIRoute)},
+    )
     app.add_middleware(LingeringClose)
     return app
 

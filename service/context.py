@@ -6,6 +6,7 @@ from typing import Annotated
 from fastapi import Depends, Path, Request
 
 from service.downloads import OpenResults
+from service.metrics import Metrics
 from service.problems import Problem
 from worker.changes import ChangeFeed
 from worker.queue import JobQueue
@@ -26,12 +27,14 @@ class Context:
     feed : ChangeFeed
         Changes of jobs, for those who wait.
     results : OpenResults
+    metrics : Metrics
     """
 
     settings: Settings
     queue: JobQueue
     feed: ChangeFeed
     results: OpenResults
+    metrics: Metrics
 
     @property
     def storage(self) -> ObjectStorage:

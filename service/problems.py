@@ -335,10 +335,12 @@ def _of_exceptions(module: ModuleType) -> list[ProblemType]:
     return found
 
 
-CATALOGUE: dict[str, ProblemType] = {
-    kind.slug: kind
-    for kind in (*_of_exceptions(errors), *_of_exceptions(worker_problems), *_OF_THE_SERVICE)
-}
+_OF_JOBS = (*_of_exceptions(errors), *_of_exceptions(worker_problems))
+
+CATALOGUE: dict[str, ProblemType] = {kind.slug: kind for kind in (*_OF_JOBS, *_OF_THE_SERVICE)}
+
+JOB_PROBLEMS = frozenset(kind.slug for kind in _OF_JOBS)
+"""Problems that may end a job."""
 
 
 def example_responses(*slugs: str) -> dict[int | str, dict[str, Any]]:
