@@ -129,7 +129,7 @@ def evaluate(
         raise InvalidOption(
             f"frame must be auto, camera or object; it was {frame!r}.", option="frame"
         )
-    shapes = np.asarray(reconstruction.shapes)
+    shapes = reconstruction.shapes
     frames, points = shapes.shape[:2]
     truth = as_shapes(ground_truth, frames, points)
 
@@ -266,7 +266,8 @@ def _blocks(
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield both arrays by chunks of points, as (T, 3, n) in double precision.
 
-    Chunks of points suit row-major and column-major files alike: neither is read twice.
+    Chunks of points suit row-major and column-major files alike: neither is read twice. Shapes that
+    are a dask array are computed block by block.
     """
     frames, points = shapes.shape[:2]
     size = max(1, _BLOCK_BYTES // (24 * frames))
@@ -274,7 +275,7 @@ def _blocks(
         chosen = np.s_[:, start : start + size]
         yield (
             truth[chosen].transpose(0, 2, 1).astype(np.float64, order="C"),
-            shapes[chosen].transpose(0, 2, 1).astype(np.float64, order="C"),
+            np.asarray(shapes[chosen]).transpose(0, 2, 1).astype(np.float64, order="C"),
         )
 
 

@@ -20,8 +20,7 @@ from smsr.errors import (
 )
 from smsr.files import open_array
 from smsr.metrics import as_shapes, evaluate
-from smsr.options import Options
-from smsr.result import Diagnostics, Reconstruction
+from smsr.result import MovingSurface
 from smsr.synthetic import Example, make_low_rank
 
 if TYPE_CHECKING:
@@ -30,23 +29,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def reconstruction(shapes: NDArray[np.float64], cameras: NDArray[np.float64]) -> Reconstruction:
-    frames, points = shapes.shape[:2]
-    diagnostics = Diagnostics(
-        options=Options(),
-        frames=frames,
-        points=points,
-        basis_size=1,
-        camera_model="given",
-        camera_reason="",
-        converged=True,
-        stages=(),
-        singular_values=(),
-    )
-    return Reconstruction(shapes.copy(), cameras.copy(), np.zeros((frames, 2)), diagnostics)
+def reconstruction(shapes: NDArray[np.float64], cameras: NDArray[np.float64]) -> MovingSurface:
+    return MovingSurface(shapes.copy(), cameras.copy(), np.zeros((len(shapes), 2)))
 
 
-def perfect(example: Example) -> Reconstruction:
+def perfect(example: Example) -> MovingSurface:
     return reconstruction(example.ground_truth, example.cameras)
 
 
@@ -56,7 +43,7 @@ def orthogonal(seed: int, sign: float) -> NDArray[np.float64]:
     return q
 
 
-def turned(example: Example, q: NDArray[np.float64]) -> Reconstruction:
+def turned(example: Example, q: NDArray[np.float64]) -> MovingSurface:
     """The same scene with the object frame turned by q; the images stay."""
     return reconstruction(example.ground_truth @ q.T, example.cameras @ q.T)
 
@@ -169,6 +156,22 @@ def test_blocks_of_points_give_what_one_block_gives(monkeypatch: pytest.MonkeyPa
     assert parts.e3d == pytest.approx(whole.e3d, rel=1e-12)
     np.testing.assert_allclose(parts.per_frame, whole.per_frame, rtol=1e-11)
     assert parts.relative_rms == pytest.approx(whole.relative_rms, rel=1e-12)
+
+
+def test_shapes_of_a_dask_array_are_computed_by_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    dask_array = pytest.importorskip("dask.array", reason="dask is not installed")
+    monkeypatch.setattr(smsr.metrics, "_BLOCK_BYTES", 24 * 12 * 7)
+    seen = []
+
+    def count(block: NDArray[np.float64]) -> NDArray[np.float64]:
+        seen.append(block.shape[1])
+        return block
+
+    shapes = dask_array.from_array(EXAMPLE.ground_truth, chunks=(12, 7, 3))
+    shapes = shapes.map_blocks(count, dtype=np.float64, meta=np.empty((0, 0, 0)))
+    result = MovingSurface(shapes, EXAMPLE.cameras, np.zeros((12, 2)))
+    assert evaluate(EXAMPLE.ground_truth, result).e3d == pytest.approx(0, abs=1e-12)
+    assert sorted(seen) == [6, 6, 7, 7, 7, 7]  # two passes, and each block once in each
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02, 0.1, 0.3])
