@@ -171,10 +171,8 @@ class JobQueue:
 
     def position(self, job_id: str) -> int | None:
         """Return how many jobs are ahead of a queued one, None when it is not queued."""
-        ticket = cast("bytes | None", self.redis.hget(f"{PREFIX}:job:{job_id}", "ticket"))
-        if ticket is None:
-            return None
-        return cast("int | None", self.redis.lpos(self.rq.key, ticket.decode()))
+        ticket = self.records.ticket(job_id)
+        return cast("int | None", self.redis.lpos(self.rq.key, ticket)) if ticket else None
 
     def length(self) -> int:
         """Return the number of jobs that wait for a worker."""
@@ -233,6 +231,8 @@ class JobQueue:
             max_attempts=settings.max_attempts,
             problem=problem_document(WorkerLost(settings.max_attempts)),
         )
+        for job_id in outcomes:
+            self.discard_ticket(self.records.ticket(job_id))
         silent = [job_id for job_id, outcome in outcomes.items() if outcome == "queued"]
         for job_id in silent:
             log.warning("worker lost, job queued again", job=job_id)

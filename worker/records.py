@@ -358,6 +358,11 @@ class RecordStore:
             counters.decode(counted),
         )
 
+    def ticket(self, job_id: str) -> str:
+        """Return the RQ job that carries a job, '' for none."""
+        ticket = cast("bytes | None", self.redis.hget(record_key(job_id), "ticket"))
+        return ticket.decode() if ticket else ""
+
     def expired(self, limit: int = 100) -> Sequence[str]:
         """Return ids of jobs whose time to live has passed."""
         due = self.redis.zrangebyscore(f"{PREFIX}:expiry", "-inf", self._now(), start=0, num=limit)

@@ -75,13 +75,16 @@ def test_a_job_of_a_silent_worker_is_queued_first(
     queue: JobQueue, submit: Submitter, settings: Settings
 ) -> None:
     lost, waiting = submit(), submit()
-    queue.discard_ticket(queue.rq.job_ids[0])
+    (taken, _) = queue.rq.job_ids
+    queue.redis.lmove(queue.rq.key, queue.rq.intermediate_queue_key)
     queue.records.begin_attempt(lost, worker="ann", ticket="t", lease=0.01)
     time.sleep(0.02)
     assert queue.recover().requeued == ()
     time.sleep(2 * settings.heartbeat_seconds)
     assert queue.recover().requeued == (lost,)
     assert (queue.position(lost), queue.position(waiting)) == (0, 1)
+    assert not [key for key in keys(queue, "*") if taken in key]
+    assert queue.redis.llen(queue.rq.intermediate_queue_key) == 0
 
 
 def test_cancelling_a_queued_job_leaves_nothing_in_rq(queue: JobQueue, submit: Submitter) -> None:
