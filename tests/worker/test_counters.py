@@ -171,3 +171,20 @@ def test_a_late_start_is_no_start(store: RecordStore) -> None:
     store.cancel(job_id)
     assert store.begin_attempt(job_id, worker="ann", ticket="t", lease=LEASE) is None
     assert counted(store).waits.count == 0
+
+
+def test_a_survey_costs_the_same_however_many_jobs_there_are(store: RecordStore) -> None:
+    def commands() -> int:
+        info: dict[str, int] = store.redis.info("stats")
+        return info["total_commands_processed"]
+
+    costs = []
+    for _ in range(3):
+        store.survey(60)  # connected
+        before = commands()
+        store.survey(60)
+        costs.append(commands() - before)
+        for _ in range(20):
+            job_id = created(store)
+            publish(store, job_id, begun(store, job_id), cameras=1.0)
+    assert len(set(costs)) == 1
