@@ -14,25 +14,35 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from smsr.cameras import CameraEstimate
+    from smsr.noise import VirtualPoints
     from smsr.result import StageReport
 
 _FLAT = 0.01
 _RIGID = 0.002
 _LOST = 0.01
+_NOISY = 0.02
+_UNDECIDED = 10.0  # degrees
+_WEAK_DEPTH = 0.75
 _LITTLE_ROTATION = math.radians(10.0)
 
 
-def input_cautions(values: NDArray[np.float64], kept: int) -> list[Caution]:
+def input_cautions(
+    values: NDArray[np.float64], solved: VirtualPoints, points: int
+) -> list[Caution]:
     """Judge the singular values of the measurements.
 
     Parameters
     ----------
     values : ndarray of shape (r,)
         Singular values of the centred W, largest first.
-    kept : int
-        Number of virtual points.
+    solved : VirtualPoints
+        What of them was solved for.
+    points : int
+        N.
     """
     found = []
+    rows, kept = len(solved.left), len(solved.values)
     if _part_beyond(values, 2) < _FLAT:
         found.append(
             Caution(
@@ -49,7 +59,17 @@ def input_cautions(values: NDArray[np.float64], kept: int) -> list[Caution]:
                 "to tell its deformation from noise.",
             )
         )
-    if _part_beyond(values, kept) > _LOST:
+    spread = float(np.linalg.norm(values)) / math.sqrt(rows * points)
+    if solved.noise > _NOISY * spread:
+        found.append(
+            Caution(
+                "noisy",
+                f"The tracks carry noise of {solved.noise:.3g}, {solved.noise / spread:.0%} of "
+                "their spread. It was taken off, and fine deformations with it. If it is less, "
+                "give its standard deviation as the option noise.",
+            )
+        )
+    elif solved.noise == 0.0 and _part_beyond(values, kept) > _LOST:
         found.append(
             Caution(
                 "truncated",
@@ -60,19 +80,44 @@ def input_cautions(values: NDArray[np.float64], kept: int) -> list[Caution]:
     return found
 
 
-def camera_cautions(rotations: NDArray[np.float64]) -> list[Caution]:
-    """Judge cameras (T, 3, 3) by how far their viewing directions spread."""
+def camera_cautions(rotations: NDArray[np.float64], estimate: CameraEstimate) -> list[Caution]:
+    """Judge cameras (T, 3, 3) by the spread of viewing directions and how well they are decided."""
+    found = []
     axes = rotations[:, 2]
     # The farthest from the farthest: nearly the widest angle, without comparing all pairs.
     far = axes[(axes @ axes[0]).argmin()]
     spread = math.acos(min(1.0, max(-1.0, float((axes @ far).min()))))
-    if spread >= _LITTLE_ROTATION:
+    if spread < _LITTLE_ROTATION:
+        found.append(
+            Caution(
+                "little-rotation",
+                f"The camera turns by {math.degrees(spread):.1f} degrees only around the object, "
+                "so depth is uncertain. Tracks over more frames or with more motion would help.",
+            )
+        )
+    disagreement = estimate.criteria.get("disagreement", 0.0)
+    if estimate.model == "relaxed" and disagreement > _UNDECIDED:
+        found.append(
+            Caution(
+                "cameras-undecided",
+                f"Cameras that differ by {disagreement:.0f} degrees explain the tracks about "
+                "equally well, and no simple path of the camera decides between them. Shapes may "
+                "turn slowly against each other; compare them in the camera frame.",
+            )
+        )
+    return found
+
+
+def depth_cautions(complexity: float) -> list[Caution]:
+    """Judge how much simpler depth makes the shapes, see `DepthProblem.complexity`."""
+    if complexity <= _WEAK_DEPTH:
         return []
     return [
         Caution(
-            "little-rotation",
-            f"The camera turns by {math.degrees(spread):.1f} degrees only around the object, so "
-            "depth is uncertain. Tracks over more frames or with more motion would help.",
+            "weak-depth",
+            f"With depth the shapes are only {max(0.0, 1.0 - complexity):.0%} simpler than the "
+            "flat tracks, so the tracks say little about depth. It was reduced where they say "
+            "nothing.",
         )
     ]
 

@@ -109,3 +109,18 @@ def smoothed_lifting(
         inner=np.concatenate([left.T, rest]),
         cameras=None,
     )
+
+
+def denoised_lifting(shapes: NDArray[np.float64], coordinates: NDArray[np.float64]) -> Lifting:
+    """Return the map for measurements less their noise, ``S = S_q C W``.
+
+    What of the measurements no virtual point stands for is noise and is left out.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (T, 3, q)
+        S_q, shapes of the virtual points.
+    coordinates : ndarray of shape (q, 2T)
+        C of `smsr.noise.VirtualPoints`.
+    """
+    return Lifting(outer=shapes, inner=coordinates, cameras=None)

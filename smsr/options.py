@@ -65,15 +65,23 @@ class Options:
         minimum=4,
         maximum=4096,
     )
+    noise: float | None = option(
+        None,
+        "Standard deviation of the noise of the tracks, in their own units; it is taken off "
+        "before solving. 0 reproduces the tracks exactly; null has it estimated in the default "
+        "preset and is 0 in the preset 'paper'.",
+        minimum=0.0,
+    )
     camera_model: Literal["auto", "relaxed", "uniform", "paper"] = option(
         "auto",
-        "How cameras are found: 'relaxed' by a convex problem, 'uniform' as a turn of constant "
+        "How cameras are found: 'relaxed' by convex problems, 'uniform' as a turn of constant "
         "velocity, 'paper' by rank-3 thresholding. 'auto' is 'paper' in that preset; otherwise "
-        "'uniform' where it explains the relaxed cameras, else 'relaxed'.",
+        "the relaxed cameras, or a uniform or stop-and-go turn where that explains them; for a "
+        "rigid object they come from its factorisation.",
     )
     basis_size: int | None = option(
         None,
-        "Number K of basis shapes in the camera stage; null leaves it to the method.",
+        "Number K of basis shapes in the camera stage; null has several tried.",
         minimum=1,
         maximum=30,
     )
@@ -101,8 +109,8 @@ class Options:
         "auto",
         "How shapes are found: 'nuclear' minimises the nuclear norm to convergence, 'reweighted' "
         "a reweighted nuclear norm and the motion between frames, 'paper' follows the published "
-        "schedule of penalties. 'auto' is 'paper' in that preset; otherwise 'reweighted' with a "
-        "uniform camera, else 'nuclear'.",
+        "schedule of penalties. 'auto' is 'paper' in that preset; otherwise 'reweighted', with "
+        "depth faded out where the tracks do not bear it out, and one shape for a rigid object.",
     )
     shape_iterations: int = option(
         1000, "Most iterations of the shape stage.", minimum=1, maximum=100_000
@@ -123,8 +131,9 @@ class Options:
         maximum=10.0,
     )
     motion_weight: float = option(
-        0.5,
-        "Weight of least motion between frames in the reweighted shape stage.",
+        1.0,
+        "Weight of least motion between frames in the reweighted shape stage, relative to what the "
+        "method finds fit; 0 for none.",
         minimum=0.0,
         maximum=1000.0,
     )
@@ -153,6 +162,8 @@ def resolve(options: Options, *, points: int) -> Options:
     changes: dict[str, Any] = {}
     if options.smoothing is None:
         changes["smoothing"] = published and points <= _SPARSE_POINTS
+    if published and options.noise is None:
+        changes["noise"] = 0.0
     if published and options.camera_model == "auto":
         changes["camera_model"] = "paper"
     if published and options.shape_method == "auto":

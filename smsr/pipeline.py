@@ -20,10 +20,16 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from smsr.cameras import estimate_cameras, fix_gauge
-from smsr.cautions import camera_cautions, convergence_cautions, input_cautions
+from smsr.cautions import (
+    camera_cautions,
+    convergence_cautions,
+    depth_cautions,
+    input_cautions,
+)
 from smsr.errors import Cancelled
-from smsr.lifting import exact_lifting, smoothed_lifting
+from smsr.lifting import denoised_lifting, exact_lifting, smoothed_lifting
 from smsr.measurements import as_source
+from smsr.noise import virtual_points
 from smsr.options import Options, parse, resolve
 from smsr.progress import Progress
 from smsr.result import Diagnostics, Reconstruction, StageReport
@@ -33,7 +39,7 @@ from smsr.trajectories import smooth_trajectories
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -132,6 +138,8 @@ class Solution:
     basis_size: int
     camera_model: str
     camera_reason: str
+    camera_criteria: Mapping[str, float]
+    noise: float
     cautions: tuple[Caution, ...]
 
 
@@ -147,13 +155,15 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     clock : _Clock
         Receives the reports of the stages.
     """
+    points = virtual_points(space.left, space.singular_values, space.points, options.noise).leading(
+        options.virtual_points
+    )
     # Penalties have a fixed scale, so solve for measurements of unit spectral norm.
-    kept = min(options.virtual_points, len(space.singular_values))
-    left = space.left[:, :kept]
-    values = space.singular_values[:kept] / space.singular_values[0]
-    virtual = left * values
+    unit = float(points.values[0])
+    values = points.values / unit
+    virtual = points.left * values
     with clock.stage("cameras") as hook:
-        estimate = estimate_cameras(left, values, options, hook)
+        estimate = estimate_cameras(points.left, values, options, hook)
         rotations = fix_gauge(estimate.rotations)
         clock.note(estimate)
     with clock.stage("smoothing") as hook:
@@ -162,13 +172,22 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             virtual = motion.apply(virtual)
             clock.note(motion)
     with clock.stage("shapes") as hook:
-        found = estimate_shapes(virtual, rotations, options, camera_model=estimate.model, hook=hook)
+        found = estimate_shapes(
+            virtual,
+            rotations,
+            options,
+            camera_model=estimate.model,
+            coherent=estimate.coherent,
+            hook=hook,
+        )
         clock.note(found)
     cameras = np.ascontiguousarray(rotations[:, :2])
-    if motion is None:
-        lifting = exact_lifting(found.shapes, cameras, left, values)
+    if points.noise > 0.0:
+        lifting = denoised_lifting(found.shapes * unit, points.coordinates)
+    elif motion is None:
+        lifting = exact_lifting(found.shapes, cameras, points.left, values)
     else:
-        lifting = smoothed_lifting(found.shapes, cameras, left, values, motion.basis)
+        lifting = smoothed_lifting(found.shapes, cameras, points.left, values, motion.basis)
     published = estimate.model == "paper"
     return Solution(
         cameras=cameras,
@@ -176,9 +195,12 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
         basis_size=estimate.basis_size if published else basis_size_of(found.shapes),
         camera_model=estimate.model,
         camera_reason=estimate.reason,
+        camera_criteria=estimate.criteria,
+        noise=points.noise,
         cautions=(
-            *input_cautions(space.singular_values, kept),
-            *camera_cautions(rotations),
+            *input_cautions(space.singular_values, points, space.points),
+            *camera_cautions(rotations, estimate),
+            *depth_cautions(found.complexity),
             *convergence_cautions(clock.reports),
         ),
     )
@@ -268,6 +290,8 @@ def _diagnostics(
         basis_size=solution.basis_size,
         camera_model=solution.camera_model,
         camera_reason=solution.camera_reason,
+        camera_criteria=dict(solution.camera_criteria),
+        noise=solution.noise,
         converged=all(report.converged for report in clock.reports),
         stages=tuple(clock.reports),
         singular_values=tuple(space.singular_values[:_LISTED_SINGULAR_VALUES].tolist()),

@@ -41,3 +41,12 @@ may raise, `smsr.errors.Cancelled` for one, to stop the stage."""
 
 def ignore(fraction: float, iteration: int, residual: float | None) -> None:
     """Take a stage's report and do nothing: the default hook."""
+
+
+def part_of(hook: StageHook, first: float, last: float) -> StageHook:
+    """Return a hook that reports into a part, from `first` to `last`, of another hook's range."""
+
+    def part(fraction: float, iteration: int, residual: float | None) -> None:
+        hook(first + fraction * (last - first), iteration, residual)
+
+    return part

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,11 +66,6 @@ class Diagnostics:
         Which camera candidate was taken.
     camera_reason : str
         Why.
-    camera_criteria : dict
-        The numbers that choice was based on: see `smsr.cameras.free` and `smsr.cameras.selection`.
-    noise : float
-        Standard deviation of the noise that was taken off the measurements, in their units; 0 for
-        none.
     converged : bool
         Whether every iterative stage met its tolerance.
     stages : tuple of StageReport
@@ -79,6 +74,12 @@ class Diagnostics:
         Of the centred measurement matrix, largest first (at most 100).
     cautions : tuple of Caution
         Weaknesses of this input: too little rotation, near-planar shape, and so on.
+    camera_criteria : dict
+        The numbers the choice of cameras was based on: see `smsr.cameras.free` and
+        `smsr.cameras.selection`.
+    noise : float
+        Standard deviation of the noise that was taken off the measurements, in their units; 0 for
+        none.
     """
 
     options: Options
@@ -87,12 +88,12 @@ class Diagnostics:
     basis_size: int
     camera_model: str
     camera_reason: str
-    camera_criteria: dict[str, float]
-    noise: float
     converged: bool
     stages: tuple[StageReport, ...]
     singular_values: tuple[float, ...]
     cautions: tuple[Caution, ...] = ()
+    camera_criteria: dict[str, float] = field(default_factory=dict)
+    noise: float = 0.0
 
     @property
     def seconds(self) -> dict[str, float]:

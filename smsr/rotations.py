@@ -58,6 +58,24 @@ def left_jacobian(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return jacobian
 
 
+def nearest_rotations(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotations (..., 3, 3) nearest to any (..., 3, 3) array."""
+    left, _, right = np.linalg.svd(matrices)
+    left[..., 2] *= np.linalg.det(left @ right)[..., None]
+    nearest: NDArray[np.float64] = left @ right
+    return nearest
+
+
+def mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the chordal mean (3, 3) of rotations (T, 3, 3): the rotation nearest to their sum."""
+    return nearest_rotations(rotations.sum(axis=0))
+
+
+def angles_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angles (T,), radians, between rotations (T, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(first @ second.transpose(0, 2, 1)).magnitude())
+
+
 def mirror(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the cameras that see the shape mirrored in its depth at the identity camera.
 

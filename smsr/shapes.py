@@ -8,13 +8,15 @@ cameras only the depths along the viewing directions are unknown: ``S_t = R_t^T 
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from smsr.progress import ignore
+from smsr.progress import ignore, part_of
 from smsr.proximal import singular_value_threshold, singular_values
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ class ShapeEstimate:
         Why it stopped, for a person.
     residuals : tuple of float
         Stopping residual at each iteration.
+    complexity : float
+        See `DepthProblem.complexity`; 0 where it was not measured.
     """
 
     shapes: NDArray[np.float64]
@@ -47,6 +51,7 @@ class ShapeEstimate:
     converged: bool
     reason: str
     residuals: tuple[float, ...] = ()
+    complexity: float = 0.0
 
 
 def planar_shapes(
@@ -90,11 +95,12 @@ class DepthProblem:
         Cameras completed by the viewing direction.
     """
 
-    FIRST_PENALTY = 30.0  # relative to 1 / sigma_1(P S#)
+    FIRST_PENALTY = 10.0  # relative to 1 / sigma_1(P S#)
     RELAXATION = 1.6
     BALANCE_EVERY = 10
     BALANCE_RATIO = 5.0
     STALLED = 0.9
+    LEAST_PENALTY = 1e-3  # relative to the first
 
     def __init__(self, measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> None:
         self.frames = len(rotations)
@@ -162,6 +168,21 @@ class DepthProblem:
         """Return the singular values of P S#, largest first."""
         return singular_values(self.shapes - self.shapes.mean(axis=0))
 
+    def complexity(self) -> float:
+        """Return the nuclear norm of the shapes over that of the tracks, taken for flat shapes.
+
+        Depth that is right makes the shapes simpler than the tracks; where this number is near 1,
+        depth explains nothing.
+        """
+        flat = self.measurements.reshape(self.frames, -1)
+        of_tracks = float(singular_values(flat - flat.mean(axis=0)).sum())
+        return float(self.spectrum().sum()) / max(of_tracks, np.finfo(float).tiny)
+
+    def image_motion(self) -> float:
+        """Return ||D W||_F^2, as seen in the image."""
+        flat = self.measurements.reshape(self.frames, -1)
+        return float((np.diff(flat, axis=0) ** 2).sum())
+
     def motion(self) -> float:
         """Return ||D S#||_F^2."""
         return float((np.diff(self.shapes, axis=0) ** 2).sum())
@@ -206,6 +227,7 @@ class DepthProblem:
         factor = self._banded_factor(self.penalty, self.motion_weight)
         # Reweighting gives small singular values large weights, and over-relaxed steps may cycle.
         convex = np.ndim(self.weights) == 0
+        first_penalty = self.penalty
         relaxation = self.RELAXATION if convex else 1.0
         for iteration in range(1, max_iterations + 1):
             relaxed = relaxation * S + (1.0 - relaxation) * Z
@@ -228,6 +250,9 @@ class DepthProblem:
                 break
             if iteration % self.BALANCE_EVERY == 0:
                 change = self._penalty_change(primal, dual, convex)
+                # Of a rigid object no singular value is left to balance against.
+                if self.penalty * change < self.LEAST_PENALTY * first_penalty:
+                    change = 1.0
                 self.penalty *= change
                 Y = Y / change
                 factor = self._banded_factor(self.penalty, self.motion_weight)
@@ -240,7 +265,8 @@ def estimate_shapes(
     rotations: NDArray[np.float64],
     options: Options,
     *,
-    camera_model: str,
+    camera_model: str = "relaxed",
+    coherent: bool = False,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
     """Find the shapes of all frames in the way that the options ask for.
@@ -254,39 +280,33 @@ def estimate_shapes(
     options : Options
         Resolved by `smsr.options.resolve`.
     camera_model : str
-        How the cameras were found: least motion is asked for only where they cannot drift.
+        How the cameras were found: 'rigid' says that the object is.
+    coherent : bool
+        See `motion_scale`.
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    method = options.shape_method
-    if method == "auto":
-        method = "reweighted" if camera_model == "uniform" else "nuclear"
-    if method == "paper":
+    limits: dict[str, Any] = {
+        "max_iterations": options.shape_iterations,
+        "tolerance": options.shape_tolerance,
+        "hook": hook,
+    }
+    if options.shape_method == "paper":
         return published_shapes(
             measurements,
             rotations,
             penalty=options.penalty,
             penalty_growth=options.penalty_growth,
-            max_iterations=options.shape_iterations,
-            tolerance=options.shape_tolerance,
-            hook=hook,
+            **limits,
         )
-    if method == "reweighted":
-        return reweighted_shapes(
-            measurements,
-            rotations,
-            motion_weight=options.motion_weight,
-            max_iterations=options.shape_iterations,
-            tolerance=options.shape_tolerance,
-            hook=hook,
-        )
-    return low_rank_shapes(
-        measurements,
-        rotations,
-        max_iterations=options.shape_iterations,
-        tolerance=options.shape_tolerance,
-        hook=hook,
+    if options.shape_method == "nuclear":
+        return low_rank_shapes(measurements, rotations, **limits)
+    if options.shape_method == "auto" and camera_model == "rigid":
+        return rigid_shapes(measurements, rotations)
+    found = reweighted_shapes(
+        measurements, rotations, motion_weight=options.motion_weight, coherent=coherent, **limits
     )
+    return found if options.shape_method == "reweighted" else credible_depth(found, rotations)
 
 
 def low_rank_shapes(
@@ -383,7 +403,8 @@ def reweighted_shapes(
     measurements: NDArray[np.float64],
     rotations: NDArray[np.float64],
     *,
-    motion_weight: float = 0.5,
+    motion_weight: float = 1.0,
+    coherent: bool = False,
     max_iterations: int = 1000,
     tolerance: float = 1e-4,
     hook: StageHook = ignore,
@@ -391,74 +412,142 @@ def reweighted_shapes(
     """Minimise a reweighted nuclear norm and the motion of the shape between frames.
 
     Minimises ``sum_i log(sigma_i(P S#) + eps sigma_1) + lambda/2 ||D S#||_F^2`` subject to
-    W = R S by a few rounds of a weighted nuclear norm, w_i = 1 / (sigma_i + eps sigma_1). Lambda
-    scales itself: the more of the motion in the image is explained by the cameras, the more
-    weight has least motion of the shape. It needs exact cameras of an object that moves slower than
-    its camera turns.
+    W = R S by a few rounds of a weighted nuclear norm, w_i = 1 / (sigma_i + eps sigma_1). The
+    problem is not convex. It is entered from flat shapes through the plain nuclear norm, so that
+    depth is added only where it makes the shapes simpler.
 
     Parameters
     ----------
     measurements, rotations, max_iterations, tolerance, hook
         As for `low_rank_shapes`; the iterations of all rounds together are bounded.
     motion_weight : float
-        Lambda relative to ``log(||D W||^2 / ||D S#||^2) ||P S#||_* / ||D S#||^2``.
+        Lambda relative to ``motion_scale ||P S#||_* / ||D S#||^2``, so it does not depend on
+        units, frames or points; 0 for no motion term.
+    coherent : bool
+        See `motion_scale`.
     """
     problem = DepthProblem(measurements, rotations)
-    problem.start_from_least_motion()
-    converged = minimise_reweighted(
-        problem,
-        motion_weight=motion_weight,
-        rounds=_ROUNDS,
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-        hook=hook,
-    )
-    return _estimate(problem, converged)
-
-
-_ROUNDS = 6
-_ITERATIONS_PER_ROUND = 40
-_LOG_OFFSET = 0.05  # eps
-
-
-def minimise_reweighted(
-    problem: DepthProblem,
-    *,
-    motion_weight: float,
-    rounds: int,
-    max_iterations: int,
-    tolerance: float,
-    low_rank: bool = True,
-    hook: StageHook = ignore,
-) -> bool:
-    """Run the rounds of `reweighted_shapes` on a problem; `low_rank=False` keeps unit weights."""
-    image_motion = float(
-        (np.diff(problem.measurements.reshape(problem.frames, -1), axis=0) ** 2).sum()
-    )
-    tiny = np.finfo(float).tiny
-    converged = False
-    for index in range(rounds):
-        spectrum, motion = problem.spectrum(), max(problem.motion(), tiny)
+    first = min(_FIRST_ITERATIONS, max_iterations)
+    converged = problem.minimise(first, tolerance, part_of(hook, 0.0, 1 / (_ROUNDS + 1)))
+    complexity = problem.complexity()
+    scale = 0.0
+    for index in range(_ROUNDS):
+        spectrum, motion = problem.spectrum(), problem.motion()
         nuclear = float(spectrum.sum())
-        gain = max(0.0, float(np.log(max(image_motion, tiny) / motion)))
-        problem.motion_weight = motion_weight * gain * nuclear / max(motion, 1e-12 * nuclear + tiny)
-        if low_rank and index > 0:
-            weights = 1.0 / (spectrum + _LOG_OFFSET * spectrum[0])
-            problem.weights = weights * (nuclear / float(weights @ spectrum))
-        last = index == rounds - 1
         left = max_iterations - len(problem.residuals)
-        count = left if last else min(_ITERATIONS_PER_ROUND, left)
-        if count < 1:
+        if left < 1 or nuclear <= _RIGID * float(np.linalg.norm(problem.shapes)):
             break
-        first = index / rounds
-
-        def part(
-            fraction: float, iteration: int, residual: float | None, first: float = first
-        ) -> None:
-            hook(first + fraction / rounds, iteration, residual)
-
+        if index < _SCALED_ROUNDS and motion_weight > 0.0:
+            scale = motion_weight * motion_scale(problem, coherent=coherent)
+        problem.motion_weight = scale * nuclear / max(motion, 1e-12 * nuclear)
+        weights = 1.0 / (spectrum + _LOG_OFFSET * spectrum[0])
+        problem.weights = weights * (nuclear / float(weights @ spectrum))
+        count = left if index == _ROUNDS - 1 else min(_ITERATIONS_PER_ROUND, left)
+        part = part_of(hook, (index + 1) / (_ROUNDS + 1), (index + 2) / (_ROUNDS + 1))
         converged = problem.minimise(count, tolerance, part)
-    return converged
+    return dataclasses.replace(_estimate(problem, converged), complexity=complexity)
+
+
+_FIRST_ITERATIONS = 30
+_ROUNDS = 5
+_SCALED_ROUNDS = 2
+_ITERATIONS_PER_ROUND = 40
+_LOG_OFFSET = 0.15  # eps
+_RIGID = 1e-6
+
+_RATIO = 15.0
+_BY_RATIO = 0.7
+_BY_HASTE = (1.0, 16.0)
+_MOST_BY_HASTE = 2.0
+_FAST_TURN = (math.radians(1.0), math.radians(2.0))
+
+
+def motion_scale(problem: DepthProblem, *, coherent: bool) -> float:
+    """Return how strongly least motion is asked for, given the shapes found so far.
+
+    Least motion settles what the camera's turn leaves open, and does harm where the object itself
+    moves. So it is asked for in two cases: where the image moves much more than the shape, which
+    then is the camera's doing; and, with coherent cameras, where the estimated motion changes its
+    direction from frame to frame as a real one does not. The second counts in full where the
+    camera turns fast, so that neighbouring frames see depth from different sides.
+
+    Parameters
+    ----------
+    problem : DepthProblem
+        With the shapes.
+    coherent : bool
+        The cameras follow a simple path, and that path made the object move less.
+    """
+    steps = np.diff(problem.shapes, axis=0)
+    motion = max(float((steps**2).sum()), np.finfo(float).tiny)
+    ratio = max(problem.image_motion() / motion, np.finfo(float).tiny)
+    scale = _BY_RATIO * max(0.0, math.log(ratio / _RATIO))
+    if not coherent:
+        return scale
+    haste = 1.0 - float((steps[1:] * steps[:-1]).sum()) / motion
+    turns = np.diff(problem.rotations, axis=0)
+    speed = math.sqrt(float((turns**2).sum(axis=(1, 2)).mean()) / 2.0)
+    weight = float(np.interp(speed, _FAST_TURN, _BY_HASTE)) * haste
+    return max(scale, min(_MOST_BY_HASTE, weight) * max(0.0, math.log(ratio)))
+
+
+def rigid_shapes(
+    measurements: NDArray[np.float64], rotations: NDArray[np.float64]
+) -> ShapeEstimate:
+    """Return one and the same depth for all frames: the least-squares fit of a rigid shape.
+
+    Parameters
+    ----------
+    measurements, rotations
+        As for `low_rank_shapes`.
+
+    Returns
+    -------
+    ShapeEstimate
+        What the rigid shape does not explain of W stays in the image plane, so W = R S holds.
+    """
+    rigid = np.linalg.lstsq(rotations[:, :2].reshape(-1, 3), measurements, rcond=None)[0]
+    axis = rotations[:, 2]
+    return ShapeEstimate(
+        shapes=planar_shapes(measurements, rotations) + axis[:, :, None] * (axis @ rigid)[:, None],
+        iterations=0,
+        converged=True,
+        reason="one shape for all frames",
+    )
+
+
+FLAT = (0.85, 0.95)
+"""Complexities between which depth is faded out."""
+
+_DEEPEST = 2.0
+
+
+def credible_depth(estimate: ShapeEstimate, rotations: NDArray[np.float64]) -> ShapeEstimate:
+    """Return the shapes with no more depth than the tracks bear out.
+
+    Depth is faded out where it makes the shapes no simpler than the flat tracks are, and bounded
+    to twice the extent in the image, beyond which it comes from cameras that hardly turn.
+
+    Parameters
+    ----------
+    estimate : ShapeEstimate
+        With its complexity.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    """
+    seen = rotations @ estimate.shapes
+    depth, image = (seen[:, 2] ** 2).mean(), (seen[:, :2] ** 2).mean()
+    ratio = math.sqrt(depth / max(image, np.finfo(float).tiny))
+    low, high = FLAT
+    keep = min(max((high - estimate.complexity) / (high - low), 0.0), 1.0)
+    keep *= min(1.0, _DEEPEST / max(ratio, np.finfo(float).tiny))
+    if keep == 1.0:
+        return estimate
+    excess = (1.0 - keep) * seen[:, 2]
+    shapes = estimate.shapes - rotations[:, 2][:, :, None] * excess[:, None]
+    return dataclasses.replace(
+        estimate, shapes=shapes, reason=f"{estimate.reason}; {keep:.0%} of the depth was kept"
+    )
 
 
 def _estimate(problem: DepthProblem, converged: bool) -> ShapeEstimate:

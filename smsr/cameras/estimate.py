@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy as np
 from smsr import rotations as so3
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
 
@@ -22,7 +24,7 @@ class CameraEstimate:
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     model : str
-        How they were found: 'relaxed', 'paper' or 'uniform'.
+        How they were found: 'relaxed', 'uniform', 'switched', 'rigid' or 'paper'.
     basis_size : int
         K, the number of column triplets of the corrective matrix.
     iterations : int
@@ -33,6 +35,11 @@ class CameraEstimate:
         Why it stopped and why this model was taken, for a person.
     residuals : tuple of float
         Stopping residual at each iteration.
+    criteria : mapping
+        Numbers that the choice was based on, see `smsr.cameras.free` and
+        `smsr.cameras.selection`.
+    coherent : bool
+        Whether a simple path of the camera also made the object move less.
     """
 
     rotations: NDArray[np.float64]
@@ -42,6 +49,8 @@ class CameraEstimate:
     converged: bool
     reason: str
     residuals: tuple[float, ...] = ()
+    criteria: Mapping[str, float] = field(default_factory=dict)
+    coherent: bool = False
 
 
 def scaled_motion(

@@ -9,43 +9,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import minimize
 
 from smsr import rotations as so3
-from smsr.progress import ignore
-from smsr.shapes import DepthProblem
+from smsr.cameras.turn import Turn, steady_turn
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from smsr.progress import StageHook
 
 _OUTLIER = 0.2  # radians; frames farther off count less in the fit
 _FIT_STEPS = 8
 
 
-def turning_cameras(
-    velocity: NDArray[np.float64], middle: NDArray[np.float64], frames: int
-) -> NDArray[np.float64]:
-    """Return ``G_t = exp((t - c) omega) G_c`` (T, 3, 3), c = T // 2.
-
-    Parameters
-    ----------
-    velocity : ndarray of shape (3,)
-        Omega in the camera frame, radians a frame.
-    middle : ndarray of shape (3, 3)
-        G_c.
-    frames : int
-        T.
-    """
-    time = np.arange(frames) - frames // 2
-    turning: NDArray[np.float64] = so3.exp(time[:, None] * velocity) @ middle
-    return turning
-
-
-def fit_uniform_turn(
-    rotations: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fit_uniform_turn(rotations: NDArray[np.float64]) -> Turn:
     """Fit a turn of constant velocity to cameras, little disturbed by frames that are far off.
 
     Gauss-Newton steps with Huber weights on a window that grows from the middle frame, so that
@@ -58,10 +33,8 @@ def fit_uniform_turn(
 
     Returns
     -------
-    velocity : ndarray of shape (3,)
-        Omega in the camera frame, radians a frame.
-    middle : ndarray of shape (3, 3)
-        The fitted camera of frame T // 2.
+    Turn
+        Its angle is zero at frame T // 2.
     """
     frames = len(rotations)
     centre = frames // 2
@@ -87,7 +60,7 @@ def fit_uniform_turn(
             )[0]
             velocity = velocity + step[:3]
             middle = so3.exp(step[None, 3:])[0] @ middle
-    return velocity, middle
+    return steady_turn(time.astype(np.float64), velocity, middle)
 
 
 def _most_central(
@@ -97,63 +70,8 @@ def _most_central(
     frames = len(rotations)
     first = max(0, frames // 2 - 4)
     near = slice(first, first + 9)
-    back = turning_cameras(-velocity, np.eye(3), frames)[near] @ rotations[near]
+    time = np.arange(frames)[near, None] - frames // 2
+    back = so3.exp(-time * velocity) @ rotations[near]
     distances = np.linalg.norm(back[:, None] - back, axis=(2, 3)).sum(axis=1)
     central: NDArray[np.float64] = back[distances.argmin()]
     return central
-
-
-def refine_uniform_turn(
-    measurements: NDArray[np.float64],
-    velocity: NDArray[np.float64],
-    middle: NDArray[np.float64],
-    *,
-    motion_weight: float,
-    evaluations: int = 30,
-    hook: StageHook = ignore,
-) -> NDArray[np.float64]:
-    """Return the velocity near a first one whose best shape has least energy.
-
-    The energy is ``||P S#||_* + lambda/2 ||D S#||_F^2``, minimised over the shapes with W = R S
-    for each velocity and over the velocity by L-BFGS.
-
-    Parameters
-    ----------
-    measurements : ndarray of shape (2T, N)
-        W, centred, rows u1, v1, u2, ...
-    velocity, middle
-        As from `fit_uniform_turn`.
-    motion_weight : float
-        Lambda.
-    evaluations : int
-        Most evaluations of the energy.
-    hook : callable
-        See `smsr.progress.StageHook`.
-    """
-    frames = len(measurements) // 2
-    time = np.arange(frames) - frames // 2
-    problem = DepthProblem(measurements, turning_cameras(velocity, middle, frames))
-    problem.start_from_least_motion()
-    problem.motion_weight = motion_weight
-    count = 0
-
-    def energy(x: NDArray[np.float64], *_: object) -> tuple[float, NDArray[np.float64]]:
-        nonlocal count
-        now = velocity + x / frames
-        problem.turn_to(turning_cameras(now, middle, frames))
-        problem.minimise(60, 3e-4)
-        count += 1
-        hook(min(count / evaluations, 1.0), count, problem.residuals[-1])
-        jacobian = so3.left_jacobian(time[:, None] * now) * time[:, None, None]
-        gradient = np.einsum("tij,ti->j", jacobian, problem.camera_gradient()) / frames
-        return problem.value(), gradient
-
-    found = minimize(
-        energy,
-        np.zeros(3),
-        jac=True,
-        method="L-BFGS-B",
-        options={"maxiter": evaluations, "maxfun": evaluations},
-    )
-    refined: NDArray[np.float64] = velocity + found.x / frames
-    return refined

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,13 +15,19 @@ from smsr.cameras.constraints import (
     symmetric_vector,
 )
 from smsr.cameras.estimate import scaled_motion, usable_rank
+from smsr.cameras.free import angle_between, complexity, free_cameras
 from smsr.cameras.gauge import fix_gauge
 from smsr.cameras.paper import published_cameras, thresholded_factor
 from smsr.cameras.relaxed import relaxed_cameras, relaxed_factor
-from smsr.cameras.selection import part_outside_span, with_uniform_turn
-from smsr.cameras.uniform import fit_uniform_turn, refine_uniform_turn, turning_cameras
+from smsr.cameras.rigid import rigid_cameras
+from smsr.cameras.selection import part_outside_span, with_simple_path
+from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
+from smsr.cameras.turn import refine_velocity, with_shake
+from smsr.cameras.uniform import fit_uniform_turn
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
@@ -216,34 +223,153 @@ class TestPublished:
         assert estimate.basis_size == 2
 
 
+class TestFree:
+    def test_wrong_cameras_make_shapes_complex(self) -> None:
+        true = swing()
+        left, values = low_rank(true)
+        right = complexity(left * values, true)
+        assert right < 0.6
+        assert complexity(left * values, Rotation.random(60, random_state=0).as_matrix()) > right
+        assert complexity(left * values, true[::-1]) > right
+
+    def test_it_is_never_worse_than_the_first_relaxation(self) -> None:
+        for seed in range(3):
+            left, values = low_rank(swing(), modes=3, amplitude=0.4, seed=seed)
+            chosen = free_cameras(left, values)
+            first = relaxed_cameras(left, values)
+            assert chosen.criteria["complexity"] <= complexity(left * values, first.rotations)
+            assert chosen.criteria["disagreement"] >= 0.0
+            assert_cameras(chosen.rotations)
+
+    def test_a_given_basis_size_leaves_no_choice(self) -> None:
+        left, values = low_rank(swing(), modes=2)
+        chosen = free_cameras(left, values, basis_size=2)
+        expected = relaxed_cameras(left, values, basis_size=2)
+        np.testing.assert_array_equal(chosen.rotations, expected.rotations)
+        assert chosen.criteria["disagreement"] == pytest.approx(0.0, abs=1e-4)
+
+    def test_angle_between_paths_knows_neither_object_frame_nor_mirror(self) -> None:
+        G = swing()
+        turn = Rotation.random(random_state=1).as_matrix()
+        for same in (G @ turn, so3.mirror(G) @ turn):
+            assert angle_between(G, same) == pytest.approx(0.0, abs=1e-6)
+        shaken = so3.exp(0.1 * np.random.default_rng(0).standard_normal((60, 3))) @ G
+        assert angle_between(G, shaken) == pytest.approx(0.1 * np.sqrt(3.0), rel=0.2)
+
+
+class TestRigid:
+    def test_cameras_are_exact_however_little_the_object_turns(self) -> None:
+        true = orbit(20, degrees=0.5)
+        estimate = rigid_cameras(*low_rank(true, modes=0))
+        assert estimate is not None
+        assert camera_error(estimate.rotations, true) < 1e-8
+
+    def test_flat_objects_and_still_cameras_are_refused(self) -> None:
+        left, values = low_rank(orbit(20), points=12, modes=0)
+        assert rigid_cameras(left[:, :2], values[:2]) is None
+        assert rigid_cameras(*low_rank(orbit(20, degrees=0.0), modes=0)) is None
+
+
+def reversing(frames: int = 120, degrees: float = 3.0) -> Array:
+    """Return rotations that turn to and fro once."""
+    half = frames // 2
+    angles = np.radians(degrees) * (half - np.abs(np.arange(frames) - half))
+    axis = np.array([0.1, 1.0, 0.2])
+    return np.asarray(Rotation.from_rotvec(angles[:, None] * axis / 1.025).as_matrix())
+
+
+class TestTurn:
+    def test_shake_is_told_from_drift(self) -> None:
+        turn = fit_uniform_turn(orbit(200))
+        rng = np.random.default_rng(0)
+        shake = np.radians(2.0) * rng.standard_normal((200, 3))
+        time = np.linspace(0.0, 1.0, 200)[:, None]
+        drift = np.radians(8.0) * np.cos(np.pi * 2 * time) * np.array([1.0, 0.0, 0.5])
+        seen = so3.exp(shake + drift) @ turn.steady
+        found, rest = with_shake(turn, seen)
+        assert np.linalg.norm(found.shake - shake) < 0.4 * np.linalg.norm(shake)
+        assert np.linalg.norm(rest - drift) < 0.4 * np.linalg.norm(drift)
+        np.testing.assert_allclose(found.every(3).rotations, found.rotations[::3], atol=1e-12)
+
+    def test_refinement_brings_the_velocity_nearer(self) -> None:
+        true = orbit(60)
+        left, values = low_rank(true, modes=2)
+        turn = fit_uniform_turn(true)
+        shake = np.radians(1.0) * np.random.default_rng(0).standard_normal((60, 3))
+        for shaken in (np.zeros((60, 3)), shake):
+            exact = dataclasses.replace(turn, shake=shaken)
+            left, values = low_rank(exact.rotations, modes=2)
+            off = dataclasses.replace(
+                exact, velocity=turn.velocity + np.radians([0.05, 0.1, -0.05])
+            )
+            refined = refine_velocity(off, left * values, motion_weight=0.1)
+            error = np.linalg.norm(refined.velocity - turn.velocity)
+            assert error < 0.3 * np.linalg.norm(off.velocity - turn.velocity)
+
+
 class TestUniform:
     @pytest.mark.parametrize("degrees", [0.5, 5.0, 40.0])
     def test_fit_recovers_a_uniform_turn(self, degrees: float) -> None:
         true = orbit(101, degrees)
-        velocity, middle = fit_uniform_turn(true)
-        np.testing.assert_allclose(turning_cameras(velocity, middle, 101), true, atol=1e-7)
+        np.testing.assert_allclose(fit_uniform_turn(true).rotations, true, atol=1e-7)
 
     def test_fit_is_little_disturbed_by_outliers(self) -> None:
         true = orbit(100)
         spoilt = true.copy()
         spoilt[::10] = Rotation.random(10, random_state=0).as_matrix()
-        velocity, middle = fit_uniform_turn(spoilt)
-        assert np.abs(turning_cameras(velocity, middle, 100) - true).max() < 0.1
+        assert np.abs(fit_uniform_turn(spoilt).rotations - true).max() < 0.1
 
-    def test_refinement_brings_the_velocity_nearer(self) -> None:
-        true = orbit(60)
-        left, values = low_rank(true, modes=2)
-        velocity, middle = fit_uniform_turn(true)
-        off = velocity + np.radians([0.05, 0.1, -0.05])
-        refined = refine_uniform_turn(left * values, off, middle, motion_weight=0.1)
-        assert np.linalg.norm(refined - velocity) < 0.3 * np.linalg.norm(off - velocity)
 
-    def test_a_uniform_turn_is_recognised(self) -> None:
-        true = orbit(80)
+class TestSwitched:
+    def test_switching_times_and_velocity_are_found(self) -> None:
+        true = reversing()
+        rng = np.random.default_rng(0)
+        turn = fit_switched_turn(so3.exp(0.003 * rng.standard_normal((120, 3))) @ true)
+        assert turn is not None
+        assert np.degrees(np.linalg.norm(turn.velocity)) == pytest.approx(3.0, rel=0.05)
+        assert np.abs(turn.steady - true).max() < 0.06
+
+    def test_a_stop_is_found(self) -> None:
+        angles = np.radians(4.0) * np.clip(np.arange(100), 0, 60)
+        true = so3.exp(angles[:, None] * np.array([0.0, 1.0, 0.0]))
+        turn = fit_switched_turn(true)
+        assert turn is not None
+        assert np.ptp(turn.angles[70:]) == pytest.approx(0.0)
+        assert np.abs(turn.steady - true).max() < 0.05
+
+    def test_other_motions_are_refused(self) -> None:
+        rng = np.random.default_rng(1)
+        walk = np.cumsum(np.radians(0.8) * rng.standard_normal((150, 3)), axis=0)
+        for path in (orbit(100), swing(100), so3.exp(walk), np.tile(np.eye(3), (50, 1, 1))):
+            assert fit_switched_turn(path) is None
+
+    def test_segments_are_optimal(self) -> None:
+        values = np.concatenate([np.zeros(10), np.ones(7), np.full(9, -2.0)])[:, None]
+        found = segment(values, 4, 3)
+        assert found[2][0] == pytest.approx(0.0)
+        assert found[2][1] == [10, 17]
+        errors = [error for error, _ in found]
+        assert errors == sorted(errors, reverse=True)
+        assert all(np.diff([0, *breaks, 26]).min() >= 3 for _, breaks in found)
+
+    def test_noise_is_not_cut(self) -> None:
+        noise = np.random.default_rng(0).standard_normal((80, 3))
+        assert choose_breaks(noise) is None
+        assert correlation_length(noise) < 3.0
+        assert correlation_length(np.repeat(noise, 5, axis=0)) > 3.0
+
+
+class TestSelection:
+    @pytest.mark.parametrize(("path", "model"), [(orbit, "uniform"), (reversing, "switched")])
+    def test_a_simple_path_is_recognised(self, path: Callable[[int], Array], model: str) -> None:
+        true = path(120)
         left, values = low_rank(true, modes=2)
-        estimate = with_uniform_turn(relaxed_cameras(left, values), left, values)
-        assert estimate.model == "uniform"
-        assert camera_error(estimate.rotations, true) < 0.03
+        free = relaxed_cameras(left, values)
+        estimate = with_simple_path(free, left * values)
+        assert estimate.model == model
+        assert f"{model} turn" in estimate.reason
+        assert estimate.criteria[f"{model}_unexplained"] < 0.1
+        assert camera_error(estimate.rotations, true) < 0.06
 
     @pytest.mark.parametrize("amplitude", [0.1, 0.3])
     @pytest.mark.parametrize("seed", [0, 1])
@@ -253,7 +379,7 @@ class TestUniform:
         for true in (swing(80), pitch @ orbit(80)):
             left, values = low_rank(true, modes=2, amplitude=amplitude, seed=seed)
             free = relaxed_cameras(left, values)
-            estimate = with_uniform_turn(free, left, values)
+            estimate = with_simple_path(free, left * values)
             assert estimate.model == "relaxed"
             np.testing.assert_array_equal(estimate.rotations, free.rotations)
             assert "uniform turn" in estimate.reason
@@ -261,12 +387,15 @@ class TestUniform:
     def test_it_can_be_forced(self) -> None:
         left, values = low_rank(swing(20))
         free = relaxed_cameras(left, values)
-        assert with_uniform_turn(free, left, values, force=True).model == "uniform"
+        estimate = with_simple_path(free, left * values, force=True)
+        assert estimate.model == "uniform"
+        steps = so3.log(estimate.rotations[1:] @ estimate.rotations[:-1].transpose(0, 2, 1))
+        np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-9)
 
     def test_true_cameras_lie_in_the_span_of_the_measurements(self) -> None:
-        left, _ = low_rank(swing(), modes=2)
-        assert part_outside_span(left, swing()) < 1e-10
-        assert part_outside_span(left, orbit()) > 0.2
+        left, values = low_rank(swing(), modes=2)
+        assert part_outside_span(left * values, swing()) < 1e-10
+        assert part_outside_span(left * values, orbit()) > 0.2
 
 
 class TestGauge:

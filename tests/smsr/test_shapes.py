@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,11 +10,13 @@ from smsr import rotations as so3
 from smsr.shapes import (
     DepthProblem,
     basis_size_of,
+    credible_depth,
     low_rank_shapes,
-    minimise_reweighted,
+    motion_scale,
     planar_shapes,
     published_shapes,
     reweighted_shapes,
+    rigid_shapes,
 )
 
 if TYPE_CHECKING:
@@ -200,12 +203,83 @@ class TestReweighted:
 
     def test_rounds_share_the_iterations(self) -> None:
         W, rotations, _ = sequence()
-        problem = DepthProblem(W, rotations)
-        problem.start_from_least_motion()
-        minimise_reweighted(
-            problem, motion_weight=1.5, rounds=6, max_iterations=50, tolerance=1e-12
+        found = reweighted_shapes(W, rotations, max_iterations=150, tolerance=1e-12)
+        assert found.iterations == 150
+
+    @pytest.mark.parametrize("scale", [1e-3, 1e4])
+    def test_units_do_not_matter(self, scale: float) -> None:
+        W, rotations, _ = sequence()
+        plain = reweighted_shapes(W, rotations).shapes
+        scaled = reweighted_shapes(scale * W, rotations).shapes
+        np.testing.assert_allclose(scaled, scale * plain, rtol=1e-6, atol=1e-8 * scale)
+
+    def test_flat_tracks_of_a_still_camera_get_no_depth(self) -> None:
+        W, rotations, _ = sequence()
+        still = np.broadcast_to(rotations[0], rotations.shape)
+        found = reweighted_shapes(W, still)
+        assert found.complexity == pytest.approx(1.0)
+        np.testing.assert_allclose(found.shapes, planar_shapes(W, still), atol=1e-12)
+
+
+class TestMotionScale:
+    def problem(self, turn: float, wobble: float = 0.0) -> DepthProblem:
+        """A slowly stretching shape under a camera that turns by so many radians a frame."""
+        rng = np.random.default_rng(0)
+        shape = rng.standard_normal((3, 20))
+        time = np.arange(60)[:, None, None]
+        shapes = shape * (1.0 + 1e-3 * time) + wobble * rng.standard_normal((60, 3, 20))
+        rotations = so3.exp(turn * np.arange(60)[:, None] * np.array([0.0, 1.0, 0.0]))
+        problem = DepthProblem((rotations @ shapes)[:, :2].reshape(120, 20), rotations)
+        problem.shapes = shapes.reshape(60, -1)
+        return problem
+
+    def test_the_more_the_camera_turns_the_more_weight(self) -> None:
+        scales = [motion_scale(self.problem(turn), coherent=False) for turn in (0.0, 0.01, 0.1)]
+        assert scales[0] == 0.0
+        assert scales == sorted(scales)
+        assert scales[2] > scales[1]
+
+    def test_hasty_motion_counts_only_under_coherent_cameras_that_turn_fast(self) -> None:
+        slow, fast = self.problem(0.01, wobble=0.02), self.problem(0.06, wobble=0.02)
+        assert motion_scale(fast, coherent=False) == 0.0
+        assert motion_scale(fast, coherent=True) > motion_scale(slow, coherent=True)
+
+
+class TestRigid:
+    def test_rigid_shape_is_exact(self) -> None:
+        W, rotations, shapes = sequence(modes=0)
+        np.testing.assert_allclose(rigid_shapes(W, rotations).shapes, shapes, atol=1e-12)
+
+    def test_measurements_are_reproduced_and_depth_is_shared(self) -> None:
+        W, rotations, _ = sequence(modes=2)
+        seen = rotations @ rigid_shapes(W, rotations).shapes
+        np.testing.assert_allclose(seen[:, :2].reshape(W.shape), W, atol=1e-12)
+        # Depths in all frames are views of one shape.
+        assert np.linalg.matrix_rank(seen[:, 2], tol=1e-10) == 3
+
+
+class TestCredibleDepth:
+    @pytest.mark.parametrize(("complexity", "kept"), [(0.3, 1.0), (0.9, 0.5), (1.0, 0.0)])
+    def test_depth_is_faded_out_as_it_stops_to_simplify(
+        self, complexity: float, kept: float
+    ) -> None:
+        W, rotations, _ = sequence()
+        found = dataclasses.replace(low_rank_shapes(W, rotations), complexity=complexity)
+        before, after = (
+            rotations @ each.shapes for each in (found, credible_depth(found, rotations))
         )
-        assert len(problem.residuals) == 50
+        np.testing.assert_allclose(after[:, :2], before[:, :2], atol=1e-12)
+        np.testing.assert_allclose(after[:, 2], kept * before[:, 2], atol=1e-12)
+
+    def test_depth_is_bounded(self) -> None:
+        W, rotations, _ = sequence()
+        found = low_rank_shapes(W, rotations)
+        deep = rotations.transpose(0, 2, 1) @ (
+            np.array([1.0, 1.0, 1e3])[:, None] * (rotations @ found.shapes)
+        )
+        kept = credible_depth(dataclasses.replace(found, shapes=deep), rotations)
+        seen = rotations @ kept.shapes
+        assert np.sqrt((seen[:, 2] ** 2).mean() / (seen[:, :2] ** 2).mean()) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("modes", [0, 1, 3])

@@ -1,0 +1,153 @@
+"""Cameras without a motion model: the relaxation that gives the simplest shapes.
+
+One setting of the relaxed problem is right for nearly every sequence, but where it fails, it fails
+grossly, and another setting does not. The nuclear norm of the shapes tells which.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smsr import rotations as so3
+from smsr.cameras.relaxed import relaxed_cameras
+from smsr.progress import ignore, part_of
+from smsr.shapes import DepthProblem
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from smsr.cameras.estimate import CameraEstimate
+    from smsr.progress import StageHook
+
+RELAXATIONS = ((10, 1e-3), (3, 1e-3), (2, 1e-3), (10, 4e-3), (10, 1.6e-2))
+"""Basis size and trace weight of the relaxations that are tried; mostly the first is right."""
+
+_CERTAIN = 0.3
+"""Complexity below which the first relaxation is right and no other is tried."""
+
+_CLEARLY_LOWER = 0.93
+"""Part of the first complexity that another relaxation has to stay below to be taken."""
+
+_CREDIBLE = 0.75
+"""Complexity above which another relaxation is taken only if the first one failed grossly (1)."""
+
+_AS_GOOD = 1.05  # relaxations of complexities within this factor are equally likely
+_FRAMES = 200
+_DIRECTIONS = 24
+
+
+def free_cameras(
+    left: NDArray[np.float64],
+    values: NDArray[np.float64],
+    *,
+    basis_size: int | None = None,
+    max_iterations: int = 500,
+    tolerance: float = 1e-6,
+    hook: StageHook = ignore,
+) -> CameraEstimate:
+    """Find the cameras by several relaxations and take the one of the simplest shapes.
+
+    Parameters
+    ----------
+    left : ndarray of shape (2T, r)
+        Left singular vectors of the centred measurements, rows u1, v1, u2, ...
+    values : ndarray of shape (r,)
+        Singular values, largest first.
+    basis_size : int, optional
+        K, where it is known: then there is one relaxation only.
+    max_iterations, tolerance, hook
+        As for `smsr.cameras.relaxed.relaxed_cameras`.
+
+    Returns
+    -------
+    CameraEstimate
+        Its criteria are ``complexity``, see there, and ``disagreement``, the largest root mean
+        square angle in degrees to the cameras of a relaxation that is nearly as good.
+    """
+    most = max(1, len(values) // 3)
+    settings = [(basis_size or 10, RELAXATIONS[0][1])]
+    if basis_size is None:
+        settings = list(dict.fromkeys((min(K, most), weight) for K, weight in RELAXATIONS))
+    found: list[CameraEstimate] = []
+    scores: list[float] = []
+    for index, (K, weight) in enumerate(settings):
+        estimate = relaxed_cameras(
+            left,
+            values,
+            basis_size=K,
+            trace_weight=weight,
+            max_iterations=max_iterations,
+            tolerance=tolerance,
+            hook=part_of(hook, index / len(settings), (index + 1) / len(settings)),
+        )
+        found.append(estimate)
+        scores.append(complexity(left * values, estimate.rotations))
+        if scores[0] < _CERTAIN:
+            break
+    best = _best(scores)
+    angles = [
+        angle_between(found[best].rotations, other.rotations)
+        for other, score in zip(found, scores, strict=True)
+        if score <= _AS_GOOD * scores[best]
+    ]
+    K, weight = settings[best]
+    return dataclasses.replace(
+        found[best],
+        reason=f"relaxation with K = {K} and trace weight {weight:g}: {found[best].reason}",
+        criteria={"complexity": scores[best], "disagreement": math.degrees(max(angles))},
+    )
+
+
+def _best(scores: Sequence[float]) -> int:
+    """Return the first relaxation unless another has a clearly lower complexity."""
+    best = int(np.argmin(scores))
+    clear = scores[best] < _CLEARLY_LOWER * scores[0]
+    credible = scores[best] < _CREDIBLE or scores[0] > 1.0
+    return best if clear and credible else 0
+
+
+def complexity(measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> float:
+    """Return the nuclear norm of the best shapes for some cameras over that of the tracks.
+
+    With wrong cameras the object has another shape in every frame; with right ones a few basis
+    shapes do. Slow drift of the cameras hardly shows in it.
+
+    Parameters
+    ----------
+    measurements : ndarray of shape (2T, q)
+        Virtual points, strongest first.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    """
+    step = math.ceil(len(rotations) / _FRAMES)
+    problem = DepthProblem(
+        every_frame(measurements, step)[:, :_DIRECTIONS], np.ascontiguousarray(rotations[::step])
+    )
+    problem.minimise(60, 3e-4)
+    return problem.complexity()
+
+
+def every_frame(measurements: NDArray[np.float64], step: int) -> NDArray[np.float64]:
+    """Return the measurements (2T', N) of every n-th frame."""
+    if step == 1:
+        return measurements
+    points = measurements.shape[1]
+    return measurements.reshape(-1, 2, points)[::step].reshape(-1, points)
+
+
+def angle_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Return the root mean square angle of two camera paths (T, 3, 3), the object frames aligned.
+
+    Of the two mirror images of the second path the nearer one counts.
+    """
+    angles = []
+    for other in (second, so3.mirror(second)):
+        turn = so3.mean_rotation(first.transpose(0, 2, 1) @ other)
+        angles.append(float(np.sqrt((so3.angles_between(first @ turn, other) ** 2).mean())))
+    return min(angles)

@@ -1,0 +1,56 @@
+"""Cameras of an object that does not deform: the metric upgrade of the rank-3 factorisation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smsr.cameras.constraints import frame_products, symmetric_matrix
+from smsr.cameras.estimate import CameraEstimate, cameras_from_factor, scaled_motion
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RIGID_REST = 0.02
+"""An object is taken for rigid where three directions leave less than this part of the tracks."""
+
+
+def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> CameraEstimate | None:
+    """Find the cameras of a rigid object by linear least squares (Tomasi and Kanade).
+
+    Unlike the relaxed problem it has no weight on the trace, which shortens the depth of an object
+    that turns little; it is exact for a rigid object and of no use for any other.
+
+    Parameters
+    ----------
+    left : ndarray of shape (2T, r)
+        Left singular vectors of the centred measurements, rows u1, v1, u2, ...
+    values : ndarray of shape (r,)
+        Singular values, largest first.
+
+    Returns
+    -------
+    CameraEstimate or None
+        None where the measurements do not determine the upgrade: a flat object, or a camera that
+        does not turn.
+    """
+    if len(values) < 3 or len(left) < 6:
+        return None
+    motion = scaled_motion(left, values, 3)
+    uu, vv, uv = frame_products(motion)
+    constraints = np.concatenate([uu, vv, np.sqrt(2.0) * uv])
+    lengths = np.repeat([1.0, 0.0], [2 * len(uu), len(uv)])
+    solution, _, rank, _ = np.linalg.lstsq(constraints, lengths, rcond=1e-6)
+    F = symmetric_matrix(solution)
+    strengths = np.linalg.eigvalsh(F)
+    if rank < 6 or strengths[0] <= 1e-6 * strengths[-1]:
+        return None
+    return CameraEstimate(
+        rotations=cameras_from_factor(motion, F),
+        model="rigid",
+        basis_size=1,
+        iterations=0,
+        converged=True,
+        reason="three directions explain the tracks, so the object is taken for rigid",
+    )
