@@ -22,7 +22,7 @@ _EPS = float(np.finfo(np.float64).eps)
 _CACHE_ENTRIES = 48 * 1024  # in a core's second-level cache
 _PRODUCT_ENTRIES = 128 * 1024  # enough for matrix products to run at full speed
 _MANY = 64  # times as many points as rows make a sample worthwhile
-_WELL_CONDITIONED = 1e4
+_WELL_CONDITIONED = 1e6  # a singular value keeps ten digits at the least
 
 
 class NotUsableError(Exception):
