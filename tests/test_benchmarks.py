@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -35,3 +38,16 @@ def test_the_reduction_computes_the_same_as_the_whole() -> None:
     rows = run("unreduced.py", "--frames", "12", "--points", "300", "3000", "--iterations", "20")
     for row in rows[2:]:
         assert float(row[-1]) < 1e-12
+
+
+@pytest.mark.data
+def test_camera_paths(tmp_path: Path) -> None:
+    data = Path(os.environ.get("SMSR_DATA", ROOT.parent / "shared" / "data"))
+    if not data.is_dir():
+        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+    few = ("--shapes", "yoga", "--paths", "fast", "--noises", "0.01", "--processes", "1")
+    run("camera_paths.py", "--data", str(data), "--out", str(tmp_path / "paths"), *few)
+    (member,) = json.loads((tmp_path / "paths.json").read_text())
+    assert member["model"] == "uniform"
+    assert member["default"]["object"] < member["baseline"]["object"]
+    assert "| 1% | fast |" in (tmp_path / "paths.md").read_text()
