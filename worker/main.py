@@ -59,6 +59,8 @@ def run_worker(settings: Settings, *, burst: bool = False) -> None:
     """
     if settings.redis_url is None:
         raise ValueError("the settings name no Redis server")
+    stop = _EarlyStop()
+    signal.signal(signal.SIGTERM, stop)
     name = _worker_name()
     root = settings.scratch
     sweep_scratch(root)
@@ -69,15 +71,29 @@ def run_worker(settings: Settings, *, burst: bool = False) -> None:
         keeper.ensure()
         _prepare_for_forks(settings.threads_per_worker)
         try:
-            _work(settings, name, keeper, burst=burst)
+            _work(settings, name, keeper, stop, burst=burst)
         finally:
             keeper.stop()
 
 
-def _work(settings: Settings, name: str, keeper: _Keeper, *, burst: bool) -> None:
+class _EarlyStop:
+    """Handler of SIGTERM until RQ has its own: a worker that hardly started leaves nothing behind.
+
+    It is remembered, as some library that is being imported may swallow the SystemExit.
+    """
+
+    def __init__(self) -> None:
+        self.received = False
+
+    def __call__(self, *_: object) -> None:
+        self.received = True
+        sys.exit()
+
+
+def _work(settings: Settings, name: str, keeper: _Keeper, stop: _EarlyStop, *, burst: bool) -> None:
     """Work, and begin anew when the connection to Redis broke."""
     failures = 0
-    while True:
+    while not stop.received:
         supervisor = None
         started = time.monotonic()
         try:

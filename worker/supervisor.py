@@ -122,6 +122,8 @@ class Supervisor(Worker):
         super().heartbeat(*arguments, **keywords)
         if not self.is_horse:
             self.beat()
+            if self.stop_at is not None and self.get_state() != WorkerStatus.BUSY:
+                raise StopRequested  # once more: RQ waits on if anything swallowed the first
 
     def request_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         """Stop soon: at once when idle, else after a grace; at a second signal without it."""

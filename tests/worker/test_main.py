@@ -2,9 +2,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from typing import TYPE_CHECKING
 
+import pytest
+
 from tests.conftest import clean_environment
+from tests.worker.conftest import eventually
 
 if TYPE_CHECKING:
     from tests.worker.conftest import Submitter
@@ -38,6 +42,21 @@ def test_a_worker_that_ends_when_the_queue_is_empty(
     )
     assert [state(queue.records.get(job_id)) for job_id in jobs] == ["succeeded"] * 2
     assert queue.workers() == 0
+    assert list(settings.scratch.iterdir()) == []
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
+def test_a_worker_that_is_stopped_while_it_starts(settings: Settings, delay: float) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "worker.main"], env=clean_environment(**settings.to_environ())
+    )
+    eventually(lambda: settings.scratch.is_dir() and list(settings.scratch.iterdir()), "it starts")
+    time.sleep(delay)
+    process.terminate()
+    try:
+        process.wait(30)
+    finally:
+        process.kill()
     assert list(settings.scratch.iterdir()) == []
 
 
