@@ -298,8 +298,9 @@ _REMEDIES = {
     "ambiguous-layout": "Say the row order with the option `layout`.",
     "too-few-frames": "Give at least 3 frames; a usable surface needs dozens.",
     "too-few-points": "Give at least 4 points.",
-    "not-finite": "Remove or fill the points that are not seen in every frame; `detail` says where "
-    "the first bad entry stands.",
+    "not-finite": "Where NaN marks points that are not seen in a frame, set the option `missing` "
+    "to `complete`; `detail` says where the first bad entry stands.",
+    "too-few-observations": "Leave out the frame or the point that `detail` names.",
     "constant-measurements": "Check that the file holds tracks in pixels and was not cleared.",
     "ground-truth-mismatch": "Give the true 3D points of the same frames and points, in the same "
     "order.",

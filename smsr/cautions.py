@@ -80,6 +80,28 @@ def input_cautions(
     return found
 
 
+def gap_cautions(missing: float, rejected: float) -> list[Caution]:
+    """Tell what parts of the positions were filled in."""
+    found = []
+    if missing > 0.0:
+        found.append(
+            Caution(
+                "missing",
+                f"{missing:.1%} of the positions were not seen and were filled in from the rest; "
+                "shapes are less certain there.",
+            )
+        )
+    if rejected > 0.0:
+        found.append(
+            Caution(
+                "outliers",
+                f"{rejected:.2%} of the positions were taken as gross errors and filled in anew. "
+                "With outliers='keep' they are left as they are.",
+            )
+        )
+    return found
+
+
 def camera_cautions(rotations: NDArray[np.float64], estimate: CameraEstimate) -> list[Caution]:
     """Judge cameras (T, 3, 3) by the spread of viewing directions and how well they are decided."""
     found = []

@@ -128,6 +128,13 @@ class NotFinite(InputError):
     title = "The data have NaN or infinite entries"
 
 
+class TooFewObservations(InputError):
+    """A point or a frame of which so little is seen that the rest cannot be filled in."""
+
+    slug = "too-few-observations"
+    title = "Too little of a point or a frame is seen"
+
+
 class ConstantMeasurements(InputError):
     """All points coincide in every frame, so there is no shape to find."""
 

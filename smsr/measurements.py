@@ -227,6 +227,8 @@ class ChunkedSource:
 def as_source(
     measurements: ArrayLike | str | os.PathLike[str] | MeasurementSource,
     layout: Layout = "auto",
+    *,
+    check: bool = True,
 ) -> MeasurementSource:
     """Make a source of whatever holds the measurements, checking what shape and dtype can tell.
 
@@ -240,6 +242,9 @@ def as_source(
     layout : {"auto", "interleaved", "stacked"}
         Row order of a 2-D array. "auto" takes it as interleaved and recognises (T, 2, N) and
         (T, N, 2).
+    check : bool
+        Whether to check the values of small data; `smsr.completion` accepts entries that are not
+        finite here.
 
     Returns
     -------
@@ -274,7 +279,7 @@ def as_source(
     _check_dtype(array.dtype)
     source = ArraySource(_tracks(array, layout))
     _check_size(source.frames, source.points)
-    if array.nbytes <= _CHECKED_AT_ONCE:
+    if check and array.nbytes <= _CHECKED_AT_ONCE:
         check_values(source)
     return source
 
@@ -354,8 +359,8 @@ def _not_finite(first: tuple[int, int], count: int, source: MeasurementSource) -
     entries = "1 entry is" if count == 1 else f"{count} entries are"
     return NotFinite(
         f"{entries} NaN or infinite, of {total}; the first is coordinate {coordinate} of point "
-        f"{point} in frame {frame} (counting from 0). Every point must be seen in every frame: "
-        "leave out points that are lost on the way.",
+        f"{point} in frame {frame} (counting from 0). With missing='complete', NaN marks points "
+        "that are not seen in a frame, and they are filled in.",
         frame=frame,
         point=point,
         coordinate=coordinate,

@@ -58,6 +58,16 @@ class Options:
         "u rows, then all v rows. 'auto' takes a 2-D matrix as interleaved and recognises "
         "(T, 2, N) and (T, N, 2) arrays.",
     )
+    missing: Literal["refuse", "complete"] = option(
+        "refuse",
+        "What NaN in the measurements means: 'refuse' takes it as an error, 'complete' as points "
+        "that are not seen in a frame and are filled in from the rest before solving.",
+    )
+    outliers: Literal["keep", "reject"] = option(
+        "keep",
+        "What is done about gross errors: 'reject' looks for positions far off both from how all "
+        "points move and from the same track a frame earlier and later, and fills them in anew.",
+    )
     virtual_points: int = option(
         64,
         "Number of virtual points that the measurements are reduced to before solving. The "

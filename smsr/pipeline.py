@@ -24,8 +24,10 @@ from smsr.cautions import (
     camera_cautions,
     convergence_cautions,
     depth_cautions,
+    gap_cautions,
     input_cautions,
 )
+from smsr.completion import completed
 from smsr.errors import Cancelled
 from smsr.lifting import denoised_lifting, exact_lifting, smoothed_lifting
 from smsr.measurements import as_source
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from smsr.cameras import CameraEstimate
+    from smsr.completion import Gaps
     from smsr.lifting import Lifting
     from smsr.measurements import MeasurementSource
     from smsr.progress import ProgressCallback, StageHook
@@ -66,6 +69,7 @@ def reconstruct(
     measurements: ArrayLike | str | os.PathLike[str] | MeasurementSource,
     *,
     out: str | os.PathLike[str] | None = None,
+    visibility: ArrayLike | None = None,
     progress: ProgressCallback | None = None,
     options: Options | None = None,
     **option_values: Any,
@@ -82,6 +86,9 @@ def reconstruct(
         Folder, made where needed, that receives ``shapes.npy`` (T x N x 3, float32),
         ``cameras.npy`` (T x 2 x 3, float64), ``translations.npy`` (T x 2, float64) and
         ``report.json``. The shapes of the result are then a read-only memory map.
+    visibility : array_like of shape (T, N), bool, optional
+        True where a point is seen in a frame. Other positions, and NaN, are filled in as by
+        ``missing="complete"``.
     progress : callable, optional
         Called with a `Progress` often. Returning ``False`` cancels the run.
     options : Options, optional
@@ -110,7 +117,9 @@ def reconstruct(
     options = _merge(options, option_values)
     clock = _Clock(progress)
     with clock.stage("reading"):
-        source = as_source(measurements, options.layout)
+        as_given = visibility is None and options.missing == "refuse"
+        source = as_source(measurements, options.layout, check=as_given)
+        source, gaps = completed(source, options, visibility)
     with clock.stage("factorising") as hook:
         space = factorise(source, progress=hook)
     # The matrices of the solver are small: threads of BLAS cost more than they bring.
@@ -122,7 +131,9 @@ def reconstruct(
         shapes=shapes,
         cameras=solution.cameras,
         translations=space.translations.copy(),
-        diagnostics=_diagnostics(resolve(options, points=space.points), space, solution, clock),
+        diagnostics=_diagnostics(
+            resolve(options, points=space.points), space, solution, clock, gaps
+        ),
     )
     if out is not None:
         _write_rest(result, Path(out))
@@ -281,8 +292,10 @@ def _merge(options: Options | None, values: dict[str, Any]) -> Options:
 
 
 def _diagnostics(
-    options: Options, space: RowSpace, solution: Solution, clock: _Clock
+    options: Options, space: RowSpace, solution: Solution, clock: _Clock, gaps: Gaps
 ) -> Diagnostics:
+    positions = space.frames * space.points
+    missing, rejected = gaps.missing / positions, gaps.rejected / positions
     return Diagnostics(
         options=options,
         frames=space.frames,
@@ -295,7 +308,9 @@ def _diagnostics(
         converged=all(report.converged for report in clock.reports),
         stages=tuple(clock.reports),
         singular_values=tuple(space.singular_values[:_LISTED_SINGULAR_VALUES].tolist()),
-        cautions=solution.cautions,
+        cautions=(*gap_cautions(missing, rejected), *solution.cautions),
+        missing=missing,
+        rejected=rejected,
     )
 
 

@@ -80,6 +80,9 @@ class Diagnostics:
     noise : float
         Standard deviation of the noise that was taken off the measurements, in their units; 0 for
         none.
+    missing, rejected : float
+        Parts of the positions that were not seen, and that were taken as gross errors; both were
+        filled in.
     """
 
     options: Options
@@ -94,6 +97,8 @@ class Diagnostics:
     cautions: tuple[Caution, ...] = ()
     camera_criteria: dict[str, float] = field(default_factory=dict)
     noise: float = 0.0
+    missing: float = 0.0
+    rejected: float = 0.0
 
     @property
     def seconds(self) -> dict[str, float]:
