@@ -174,7 +174,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     values = points.values / unit
     virtual = points.left * values
     with clock.stage("cameras") as hook:
-        estimate = estimate_cameras(points.left, values, options, hook)
+        estimate = estimate_cameras(points.left, values, options, hook, denoised=points.noise > 0.0)
         rotations = fix_gauge(estimate.rotations)
         clock.note(estimate)
     with clock.stage("smoothing") as hook:

@@ -39,7 +39,7 @@ class CameraEstimate:
         Numbers that the choice was based on, see `smsr.cameras.free` and
         `smsr.cameras.selection`.
     coherent : bool
-        Whether a simple path of the camera also made the object move less.
+        Whether a simple path of the camera made the object move no more.
     """
 
     rotations: NDArray[np.float64]

@@ -43,6 +43,9 @@ UNEXPLAINED_LITTLE = 0.035
 MOTION_RISE_LIMIT = 0.35
 """By how much more: log of the ratio of ||D S#||^2."""
 
+COHERENT_RISE = 0.03
+"""Up to this much more motion is no more, see `CameraEstimate.coherent`."""
+
 SPAN_LIMIT = 0.06
 """Most of a path that may lie outside the leading left singular vectors of W, unless more of the
 free cameras does."""
@@ -65,6 +68,8 @@ def estimate_cameras(
     values: NDArray[np.float64],
     options: Options,
     hook: StageHook = ignore,
+    *,
+    denoised: bool = False,
 ) -> CameraEstimate:
     """Find the cameras of all frames in the way that the options ask for.
 
@@ -78,6 +83,8 @@ def estimate_cameras(
         Resolved by `smsr.options.resolve`.
     hook : callable
         See `smsr.progress.StageHook`.
+    denoised : bool
+        Weak directions of the measurements went with their noise.
     """
     if options.camera_model == "paper":
         return published_cameras(
@@ -102,7 +109,11 @@ def estimate_cameras(
     if options.camera_model == "relaxed":
         return free
     return with_simple_path(
-        free, left * values, part_of(hook, 0.5, 1.0), force=options.camera_model == "uniform"
+        free,
+        left * values,
+        part_of(hook, 0.5, 1.0),
+        force=options.camera_model == "uniform",
+        denoised=denoised,
     )
 
 
@@ -117,6 +128,7 @@ def with_simple_path(
     hook: StageHook = ignore,
     *,
     force: bool = False,
+    denoised: bool = False,
 ) -> CameraEstimate:
     """Return cameras on a uniform or switched turn where it explains the free ones, else those.
 
@@ -130,6 +142,9 @@ def with_simple_path(
         See `smsr.progress.StageHook`.
     force : bool
         Take the uniform turn, without any shake, whatever it explains.
+    denoised : bool
+        Weak directions of the measurements went with their noise, and part of what spans the
+        cameras with them: do not ask that paths lie in the span.
 
     Returns
     -------
@@ -166,7 +181,8 @@ def with_simple_path(
         turn = dataclasses.replace(verdict.turn, velocity=some.velocity)
         outside = part_outside_span(measurements, turn.rotations)
         criteria[f"{name}_outside_span"] = outside
-        if not force and outside > max(SPAN_LIMIT, part_outside_span(measurements, free.rotations)):
+        limit = max(SPAN_LIMIT, part_outside_span(measurements, free.rotations))
+        if outside > limit and not (force or denoised):
             refusals.append(f"a {name} turn lies outside the span of the tracks by {outside:.1%}")
             continue
         speed = math.degrees(float(np.linalg.norm(turn.velocity)))
@@ -175,7 +191,7 @@ def with_simple_path(
             rotations=turn.rotations,
             model=name,
             criteria=criteria,
-            coherent=(verdict.motion_rise or 0.0) <= 0.0,
+            coherent=(verdict.motion_rise or 0.0) <= COHERENT_RISE,
             reason=f"a {name} turn of {speed:.2f} degrees a frame {verdict.reason}; {free.reason}",
         )
     return dataclasses.replace(free, criteria=criteria, reason="; ".join([*refusals, free.reason]))
