@@ -6,7 +6,8 @@ The floor reads W once, multiplies two matrices with the operation counts of the
 (float64) and of the map back (float32), and writes S sequentially, each with plain numpy and plain
 files. Floor and passes alternate in one run, so that both meet the same machine; the table gives
 medians of wall time, and each ratio is the median over the runs: of wall time, and of processor
-time for machines that are busy with other things.
+time for machines that are busy with other things. On these set OMP_NUM_THREADS=1 as well: threads
+of BLAS that wait for each other make the floor look slow.
 """
 
 from __future__ import annotations

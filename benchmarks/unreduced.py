@@ -5,7 +5,8 @@
 Both run the same code for the same number of iterations with the true cameras: once on the N
 columns of the centred measurements, once on the columns of their left factor, with the pass over
 the points before and the one after counted in. The last column is the largest difference between
-the shapes relative to their largest coordinate: both compute the same.
+the shapes relative to their largest coordinate: both compute the same. On a busy machine set
+OMP_NUM_THREADS=1: threads of BLAS that wait for each other make the baseline look slow.
 """
 
 from __future__ import annotations
