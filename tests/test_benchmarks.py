@@ -51,3 +51,21 @@ def test_camera_paths(tmp_path: Path) -> None:
     assert member["model"] == "uniform"
     assert member["default"]["object"] < member["baseline"]["object"]
     assert "| 1% | fast |" in (tmp_path / "paths.md").read_text()
+
+
+@pytest.mark.data
+def test_missing_data(tmp_path: Path) -> None:
+    data = Path(os.environ.get("SMSR_DATA", ROOT.parent / "shared" / "data"))
+    if not data.is_dir():
+        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+    out = tmp_path / "missing.json"
+    cases = ("all seen", "30% at random", "5% errors, reject")
+    few = ("--sets", "yoga", "--draws", "1", "--json", str(out), "--cases", *cases)
+    rows = run("missing_data.py", "--data", str(data), *few)
+    assert len(rows) == 2 + len(cases)
+    clean, gaps, errors = json.loads(out.read_text())
+    assert 0.25 < gaps["missing"] < 0.35
+    assert 0.04 < errors["rejected"] < 0.06
+    assert errors["wrong"] == 0.0
+    for spoilt in (gaps, errors):
+        assert spoilt["e3d"] < clean["e3d"] + 1e-3
