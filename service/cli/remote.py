@@ -96,7 +96,12 @@ def submit(
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="Download results into DIR/<name>/."),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="Download results into DIR/NAME/, NAME as the file's.",
+        ),
     ] = None,
     ground_truth: Annotated[
         str | None,

@@ -131,7 +131,7 @@ def _find(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Stored
         def read() -> NDArray[Any]:
             raise problem
 
-        return StoredArray(name, (), None, read, problem)
+        return StoredArray(name, (), None, read, problem, damaged=True)
 
     if info.flag_bits & _ENCRYPTED:
         return unusable(UnsupportedFormat(f"The member {info.filename} of the .npz is encrypted."))

@@ -66,6 +66,8 @@ class StoredArray:
         Returns the array; to be called while the file is open.
     problem : InputError or None
         Why it cannot be used, raised if it is chosen.
+    damaged : bool
+        Whether its shape is lost, so that nothing tells whether it was meant.
     """
 
     name: str
@@ -73,6 +75,7 @@ class StoredArray:
     dtype: np.dtype[Any] | None
     read: Callable[[], NDArray[Any]]
     problem: InputError | None = None
+    damaged: bool = False
 
     @property
     def usable(self) -> bool:
@@ -100,16 +103,22 @@ def select(stored: Iterable[StoredArray], key: str | None, role: Role) -> Stored
     ------
     ArrayNotFound, AmbiguousArray
         None or several could be meant; the message lists what there is.
+    InputError
+        A damaged array could be meant: another must not be taken in its place.
     """
     stored = list(stored)
     if key is not None:
         return _by_key(stored, key)
     usable = [array for array in stored if array.usable and len(array.shape) > 1]
-    by_name = {array.name: array for array in usable}
+    damaged = [array for array in stored if array.damaged]
+    by_name = {array.name: array for array in (*usable, *damaged)}
     for name in CUSTOMARY_NAMES[role]:
         if name in by_name:
             return by_name[name]
     others = {name for other in CUSTOMARY_NAMES if other != role for name in CUSTOMARY_NAMES[other]}
+    for array in damaged:
+        if array.name not in others:
+            return array
     free = [array for array in usable if array.name not in others]
     for choice in ([array for array in free if _fits(array.shape, role)], free, usable, stored):
         if len(choice) == 1:

@@ -193,3 +193,33 @@ def test_a_member_beyond_the_end_of_the_file_is_refused(tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError):
         open_array(path)
+
+
+@pytest.mark.parametrize(
+    ("names", "role"),
+    [(("a", "b"), "measurements"), (("W", "X"), "measurements"), (("faces", "b"), "faces")],
+)
+def test_no_array_is_taken_in_the_place_of_a_damaged_one(
+    tmp_path: Path, names: tuple[str, str], role: Any
+) -> None:
+    first, second = names
+    path = tmp_path / "damaged.npz"
+    arrays: dict[str, Any] = {first: FACES, second: W}
+    np.savez_compressed(path, **arrays)
+    data = bytearray(path.read_bytes())
+    start = 30 + len(f"{first}.npy") + int.from_bytes(data[28:30], "little")
+    data[start : start + 40] = b"\xff" * 40
+    path.write_bytes(data)
+    with pytest.raises(UnreadableFile, match="damaged"):
+        open_array(path, role=role)
+    np.testing.assert_array_equal(open_array(path, key=second), W)
+
+
+def test_a_damaged_array_of_another_role_does_no_harm(tmp_path: Path) -> None:
+    path = tmp_path / "damaged.npz"
+    np.savez_compressed(path, faces=FACES, tracks_of_flag=W)
+    data = bytearray(path.read_bytes())
+    start = 30 + len("faces.npy") + int.from_bytes(data[28:30], "little")
+    data[start : start + 40] = b"\xff" * 40
+    path.write_bytes(data)
+    np.testing.assert_array_equal(open_array(path), W)
