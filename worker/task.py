@@ -178,7 +178,11 @@ class _Attempt:
         """Open all inputs and check them against each other before the long work begins."""
         self._stage("opening", 0.0)
         started = time.perf_counter()
-        source = as_source(self._open("measurements", options.measurements_key), options.layout)
+        source = as_source(
+            self._open("measurements", options.measurements_key),
+            options.layout,
+            check=options.missing == "refuse",
+        )
         self.report.set_size(source.frames, source.points)
         truth = faces = None
         if "ground_truth" in self.record.inputs:

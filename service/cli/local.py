@@ -104,7 +104,8 @@ def reconstruct(
     options = parse(Options, preset_and_options(Options, preset, option))
     # All inputs are checked before the work begins.
     with _naming(file):
-        source = as_source(open_array(file, key=key), options.layout)
+        measurements = open_array(file, key=key)
+        source = as_source(measurements, options.layout, check=options.missing == "refuse")
     truth = triangles = None
     if ground_truth is not None:
         with _naming(ground_truth):
