@@ -22,6 +22,12 @@ LEAST_NOISE = 0.003
 """Estimated noise below this part of the tracks' spread is taken for none: weak deformations of
 clean tracks look like it."""
 
+MOST_POINTS = 64
+"""Most virtual points that are chosen unasked."""
+
+NEGLIGIBLE_REST = 5e-4
+"""Part of the norm of the tracks that may be left without depth."""
+
 _FEWEST_FRAMES = 8
 _FEWEST_POINTS = 6
 _WEAKEST_PART = 0.25  # of the singular values, from which the level is estimated
@@ -57,8 +63,16 @@ class VirtualPoints:
         product: NDArray[np.float64] = self.left * self.values
         return product
 
-    def leading(self, count: int) -> VirtualPoints:
-        """Return the first `count` virtual points."""
+    def leading(self, count: int | None = None) -> VirtualPoints:
+        """Return the first `count` virtual points, by default as many as matter.
+
+        Those are the ones without which more than `NEGLIGIBLE_REST` of the tracks would be missing,
+        and at most `MOST_POINTS`: the solver's cost grows with the square of their number.
+        """
+        if count is None:
+            squares = self.values**2
+            rest = np.cumsum(squares[::-1])[::-1]
+            count = min(MOST_POINTS, int((rest > NEGLIGIBLE_REST**2 * rest[0]).sum()))
         if count >= len(self.values):
             return self
         return VirtualPoints(

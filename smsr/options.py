@@ -68,10 +68,11 @@ class Options:
         "What is done about gross errors: 'reject' looks for positions far off both from how all "
         "points move and from the same track a frame earlier and later, and fills them in anew.",
     )
-    virtual_points: int = option(
-        64,
+    virtual_points: int | None = option(
+        None,
         "Number of virtual points that the measurements are reduced to before solving. The "
-        "strongest singular directions are kept; what they do not span gets zero depth.",
+        "strongest singular directions are kept; what they do not span gets zero depth. Null takes "
+        "up to 64, as many as make up all but 0.05 % of the tracks.",
         minimum=4,
         maximum=4096,
     )

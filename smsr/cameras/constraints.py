@@ -52,19 +52,30 @@ class OrthonormalityForm:
         b, zero for the homogeneous constraints.
     constant : float
         c, the value of ``||A f - a||^2`` at f = 0.
-    lipschitz : float
-        Largest eigenvalue of H, the Lipschitz constant of the gradient.
     """
 
     hessian: NDArray[np.float64]
     linear: NDArray[np.float64]
     constant: float
-    lipschitz: float
+
+    def lipschitz(self) -> float:
+        """Return the largest eigenvalue of H, the Lipschitz constant of the gradient."""
+        return _largest_eigenvalue(self.hessian)
 
     def gradient(self, f: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``H f - b``."""
         gradient: NDArray[np.float64] = self.hessian @ f - self.linear
         return gradient
+
+    def leading(self, n: int) -> OrthonormalityForm:
+        """Return the form of the first n columns of the motion matrix."""
+        whole = (math.isqrt(8 * len(self.linear) + 1) - 1) // 2
+        if n == whole:
+            return self
+        rows, columns = np.triu_indices(whole)
+        inside = np.flatnonzero((rows < n) & (columns < n))
+        hessian = np.ascontiguousarray(self.hessian[np.ix_(inside, inside)])
+        return OrthonormalityForm(hessian, self.linear[inside], self.constant)
 
     def residual(self, f: NDArray[np.float64]) -> float:
         """Return ``||A f - a||^2``, at least 0."""
@@ -123,7 +134,7 @@ def orthonormality_form(motion: NDArray[np.float64], *, unit_scale: bool) -> Ort
             constant += 2.0 * len(uu)
         else:
             hessian += (uu - vv).T @ (uu - vv)
-    return OrthonormalityForm(hessian, linear, constant, _largest_eigenvalue(hessian))
+    return OrthonormalityForm(hessian, linear, constant)
 
 
 def _largest_eigenvalue(H: NDArray[np.float64]) -> float:

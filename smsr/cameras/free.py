@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smsr import rotations as so3
+from smsr.cameras.constraints import orthonormality_form
+from smsr.cameras.estimate import scaled_motion, usable_rank
 from smsr.cameras.relaxed import relaxed_cameras
 from smsr.progress import ignore, part_of
 from smsr.shapes import DepthProblem
@@ -74,6 +76,8 @@ def free_cameras(
     settings = [(basis_size or 10, RELAXATIONS[0][1])]
     if basis_size is None:
         settings = list(dict.fromkeys((min(K, most), weight) for K, weight in RELAXATIONS))
+    largest = usable_rank(values, 3 * max(K for K, _ in settings))
+    form = orthonormality_form(scaled_motion(left, values, largest), unit_scale=True)
     found: list[CameraEstimate] = []
     scores: list[float] = []
     for index, (K, weight) in enumerate(settings):
@@ -82,6 +86,7 @@ def free_cameras(
             values,
             basis_size=K,
             trace_weight=weight,
+            form=form,
             max_iterations=max_iterations,
             tolerance=tolerance,
             hook=part_of(hook, index / len(settings), (index + 1) / len(settings)),

@@ -122,12 +122,13 @@ def thresholded_factor(
     """
     frames = len(motion) // 2
     form = orthonormality_form(motion, unit_scale=False)
+    lipschitz = form.lipschitz()
     lengths = symmetric_vector(motion.T @ motion) / len(motion)
     f = symmetric_vector(nearest_semidefinite(start, 3))
     f = _scaled(f, lengths)
     changes: list[float] = []
     for _ in range(max_iterations):
-        F = nearest_semidefinite(symmetric_matrix(f - form.gradient(f) / form.lipschitz), 3)
+        F = nearest_semidefinite(symmetric_matrix(f - form.gradient(f) / lipschitz), 3)
         new = _scaled(symmetric_vector(F), lengths)
         changes.append(float(np.linalg.norm(new - f) / np.linalg.norm(new)))
         f = new

@@ -15,6 +15,7 @@ from smsr.proximal import eigenvalue_threshold
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from smsr.cameras.constraints import OrthonormalityForm
     from smsr.progress import StageHook
 
 _RELAXATION = 1.6
@@ -26,6 +27,7 @@ def relaxed_cameras(
     *,
     basis_size: int = 10,
     trace_weight: float = 1e-3,
+    form: OrthonormalityForm | None = None,
     max_iterations: int = 500,
     tolerance: float = 1e-6,
     hook: StageHook = ignore,
@@ -49,6 +51,8 @@ def relaxed_cameras(
         Largest K; fewer are used where the measurements have rank below 3K.
     trace_weight : float
         Weight of the trace relative to the number of frames.
+    form : OrthonormalityForm, optional
+        The constraints at this basis size or a larger one, where they are known.
     max_iterations : int
         Of the alternating direction method.
     tolerance : float
@@ -61,6 +65,7 @@ def relaxed_cameras(
     F, residuals = relaxed_factor(
         motion,
         trace_weight=trace_weight,
+        form=form,
         max_iterations=max_iterations,
         tolerance=tolerance,
         hook=hook,
@@ -80,6 +85,7 @@ def relaxed_factor(
     motion: NDArray[np.float64],
     *,
     trace_weight: float = 1e-3,
+    form: OrthonormalityForm | None = None,
     max_iterations: int = 500,
     tolerance: float = 1e-6,
     hook: StageHook = ignore,
@@ -95,7 +101,7 @@ def relaxed_factor(
     ----------
     motion : ndarray of shape (2T, n)
         M', see `smsr.cameras.estimate.scaled_motion`.
-    trace_weight, max_iterations, tolerance, hook
+    trace_weight, form, max_iterations, tolerance, hook
         As for `relaxed_cameras`.
 
     Returns
@@ -106,7 +112,9 @@ def relaxed_factor(
         Stopping residual in each iteration.
     """
     frames, n = len(motion) // 2, motion.shape[1]
-    form = orthonormality_form(motion, unit_scale=True)
+    if form is None:
+        form = orthonormality_form(motion, unit_scale=True)
+    form = form.leading(n)
     H, b = form.hessian / frames, form.linear / frames
     penalty = trace_weight
     system = cho_factor(H + penalty * np.eye(len(H)), check_finite=False)

@@ -115,7 +115,7 @@ class TestConstraints:
         f = symmetric_vector(F)
         assert form.residual(f) == pytest.approx(direct)
         np.testing.assert_allclose(form.hessian, form.hessian.T, atol=1e-9)
-        assert form.lipschitz >= np.linalg.eigvalsh(form.hessian)[-1]
+        assert form.lipschitz() >= np.linalg.eigvalsh(form.hessian)[-1]
 
     def test_unit_form_is_the_distance_of_the_gram_matrices_from_the_identity(self) -> None:
         M = np.random.default_rng(0).standard_normal((40, 6))
