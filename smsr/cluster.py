@@ -24,6 +24,7 @@ from smsr.mapping import Workspace
 from smsr.progress import ignore
 from smsr.sinks import sink_for
 from smsr.streaming import blas_threads, map_chunks
+from smsr.triangles import triangle_of
 
 if TYPE_CHECKING:
     import os
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from smsr.mapping import Operator
     from smsr.measurements import Chunk
     from smsr.progress import StageHook
+    from smsr.triangles import Triangle
 
 Result = TypeVar("Result")
 
@@ -83,6 +85,12 @@ class DaskSource:
             for start in range(points.start, points.stop, size):
                 part = slice(start, min(start + size, points.stop))
                 yield part, here[:, part.start - points.start : part.stop - points.start]
+
+    def triangles(
+        self, shift: NDArray[np.float64], size: int, workers: int | None
+    ) -> Iterator[tuple[int, Triangle]]:
+        """Reduce blocks of about `size` points where they are."""
+        return self.map(partial(_reduce, shift=shift), size, workers)
 
     def map(
         self, work: Callable[[slice, NDArray[Any]], Result], size: int, workers: int | None
@@ -208,6 +216,11 @@ def _apply(
     work: Callable[[slice, NDArray[Any]], Result], points: slice, block: NDArray[Any]
 ) -> Result:
     return work(points, block)
+
+
+def _reduce(_points: slice, block: NDArray[Any], *, shift: NDArray[np.float64]) -> Triangle:
+    """Return what stays of a block."""
+    return triangle_of(block, shift)
 
 
 def _shapes(

@@ -20,7 +20,6 @@ from typing import (
     Protocol,
     TypeAlias,
     TypeGuard,
-    TypeVar,
     runtime_checkable,
 )
 
@@ -29,6 +28,7 @@ import numpy as np
 from smsr.errors import (
     AmbiguousLayout,
     ConstantMeasurements,
+    InputError,
     NotFinite,
     NotNumeric,
     OddRowCount,
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
     from smsr.mapping import Operator
     from smsr.progress import StageHook
+    from smsr.triangles import Triangle
 
-Result = TypeVar("Result")
 Layout: TypeAlias = Literal["auto", "interleaved", "stacked"]
 Chunk: TypeAlias = "tuple[slice, NDArray[Any]]"
 
@@ -104,10 +104,10 @@ class RemoteSource(MeasurementSource, Protocol):
         """Return the first column (2T,) of W."""
         ...
 
-    def map(
-        self, work: Callable[[slice, NDArray[Any]], Result], size: int, workers: int | None
-    ) -> Iterator[tuple[int, Result]]:
-        """Apply `work` to all blocks; see `smsr.streaming.map_chunks`."""
+    def triangles(
+        self, shift: NDArray[np.float64], size: int, workers: int | None
+    ) -> Iterator[tuple[int, Triangle]]:
+        """Reduce blocks of about `size` points; yields the end of each block and its triangle."""
         ...
 
     def map_back(
@@ -236,9 +236,9 @@ def as_source(
     ----------
     measurements : ndarray, memmap, path or MeasurementSource
         W as (2T, N), (T, 2, N), (T, N, 2) or, stacked, (2T, N) with all u rows first or (2, T, N);
-        the path of a file that `smsr.files.open_array` reads; a dask array (`smsr.cluster`); or a
-        source, which passes unchanged. For data that come as an iterator of blocks see
-        `ChunkedSource`.
+        the path of a file that `smsr.files.open_array` reads; a dask array (`smsr.cluster`); an
+        array of PyTorch, CuPy or another library of the array API (`smsr.devices`); or a source,
+        which passes unchanged. For data that come as an iterator of blocks see `ChunkedSource`.
     layout : {"auto", "interleaved", "stacked"}
         Row order of a 2-D array. "auto" takes it as interleaved and recognises (T, 2, N) and
         (T, N, 2).
@@ -267,19 +267,14 @@ def as_source(
         _check_size(measurements.frames, measurements.points)
         return measurements
     if _is_dask(measurements):
-        from smsr.cluster import DaskSource
-
-        _check_dtype(measurements.dtype)
-        tracks: Any = _tracks(measurements, layout)
-        _check_size(tracks.shape[0], tracks.shape[2])
-        if measurements.ndim == 2 and layout != "stacked":
-            return DaskSource(measurements)  # as it is: a reshape would cut its chunks
-        return DaskSource(tracks.reshape(-1, tracks.shape[2]))
-    array = _as_array(measurements)
-    _check_dtype(array.dtype)
-    source = ArraySource(_tracks(array, layout))
+        return _dask_source(measurements, layout)
+    source = _device_source(measurements, layout)
+    if source is None:
+        array = _as_array(measurements)
+        _check_dtype(array.dtype)
+        source = ArraySource(_tracks(array, layout))
     _check_size(source.frames, source.points)
-    if check and array.nbytes <= _CHECKED_AT_ONCE:
+    if check and _bytes(source) <= _CHECKED_AT_ONCE:
         check_values(source)
     return source
 
@@ -374,6 +369,36 @@ def _is_dask(measurements: object) -> TypeGuard[Any]:
     return module is not None and isinstance(measurements, module.Array)
 
 
+def _dask_source(array: Any, layout: Layout) -> MeasurementSource:
+    from smsr.cluster import DaskSource
+
+    _check_dtype(array.dtype)
+    tracks: Any = _tracks(array, layout)
+    _check_size(tracks.shape[0], tracks.shape[2])
+    if array.ndim == 2 and layout != "stacked":
+        return DaskSource(array)  # as it is: a reshape would cut its chunks
+    return DaskSource(tracks.reshape(-1, tracks.shape[2]))
+
+
+def _device_source(measurements: Any, layout: Layout) -> MeasurementSource | None:
+    """Take an array of another library than numpy; None where numpy has to read it."""
+    if isinstance(measurements, np.ndarray) or not hasattr(measurements, "__dlpack__"):
+        return None
+    try:
+        from smsr import devices
+    except ModuleNotFoundError:  # without the extra
+        return None
+    if not devices.usable(measurements):
+        return None
+    _check_dtype(devices.dtype_of(measurements))
+    array = devices.without_gradient(measurements)
+    return devices.DeviceSource(_tracks(array, layout, devices.library(array)))
+
+
+def _bytes(source: MeasurementSource) -> int:
+    return 2 * source.frames * source.points * source.dtype.itemsize
+
+
 def _as_array(measurements: object) -> NDArray[Any]:
     if isinstance(measurements, np.ma.MaskedArray) and np.ma.is_masked(measurements):
         return np.where(np.ma.getmaskarray(measurements), np.nan, np.ma.getdata(measurements))
@@ -381,6 +406,13 @@ def _as_array(measurements: object) -> NDArray[Any]:
         return np.asarray(measurements)
     except ValueError as error:
         raise WrongShape(f"The measurements are no array: {error}.") from None
+    except (TypeError, RuntimeError) as error:
+        if not hasattr(measurements, "__dlpack__"):
+            raise
+        raise InputError(
+            f"numpy cannot read the measurements: {error} The extra smsr[gpu] works on them where "
+            "they are, given a device with double precision."
+        ) from None
 
 
 def _check_dtype(dtype: np.dtype[Any]) -> None:
@@ -406,9 +438,9 @@ def _check_size(frames: int, points: int) -> None:
         )
 
 
-def _tracks(array: NDArray[Any], layout: Layout) -> NDArray[Any]:
-    """View an array of any layout as (T, 2, N)."""
-    shape = array.shape
+def _tracks(array: Any, layout: Layout, library: Any = np) -> Any:
+    """View an array of any layout, and of any library, as (T, 2, N)."""
+    shape = tuple(array.shape)
     if array.ndim == 2:
         rows, points = shape
         if rows % 2:
@@ -419,8 +451,8 @@ def _tracks(array: NDArray[Any], layout: Layout) -> NDArray[Any]:
                 rows=rows,
             )
         if layout == "stacked":
-            return array.reshape(2, rows // 2, points).transpose(1, 0, 2)
-        return array.reshape(rows // 2, 2, points)
+            return library.permute_dims(library.reshape(array, (2, rows // 2, points)), (1, 0, 2))
+        return library.reshape(array, (rows // 2, 2, points))
     if array.ndim != 3:
         raise WrongShape(
             f"The measurements have shape {shape}; expected (2T, N), (T, 2, N) or (T, N, 2).",
@@ -433,7 +465,7 @@ def _tracks(array: NDArray[Any], layout: Layout) -> NDArray[Any]:
                 "(2, T, N). For (T, 2, N) or (T, N, 2) leave layout at 'auto'.",
                 shape=list(shape),
             )
-        return array.transpose(1, 0, 2)
+        return library.permute_dims(array, (1, 0, 2))
     if shape[1] == 2 and shape[2] == 2 and layout == "auto":
         raise AmbiguousLayout(
             f"The measurements have shape {shape}, which could be (T, 2, N) or (T, N, 2). Pass "
@@ -443,7 +475,7 @@ def _tracks(array: NDArray[Any], layout: Layout) -> NDArray[Any]:
     if shape[1] == 2:
         return array
     if shape[2] == 2:
-        return array.transpose(0, 2, 1)
+        return library.permute_dims(array, (0, 2, 1))
     hint = " For (2, T, N) pass layout='stacked'." if shape[0] == 2 else ""
     raise WrongShape(
         f"The measurements have shape {shape}; of three axes the second or the last must have "

@@ -80,8 +80,9 @@ def reconstruct(
     ----------
     measurements : ndarray, memmap, path or MeasurementSource
         W: tracks of N points over T frames as (2T, N), rows u1, v1, u2, v2, ..., or any layout
-        that `smsr.options.Options.layout` names; a path of a file that `smsr.files` reads; or a
-        source of chunks.
+        that `smsr.options.Options.layout` names; a path of a file that `smsr.files` reads; a
+        source of chunks; a dask array; or, with the extra ``smsr[gpu]``, a PyTorch or CuPy array,
+        whose points are worked on where they are.
     out : path, optional
         Folder, made where needed, that receives ``shapes.npy`` (T x N x 3, float32),
         ``cameras.npy`` (T x 2 x 3, float64), ``translations.npy`` (T x 2, float64) and

@@ -124,7 +124,7 @@ def factorise(
     triangles: Iterator[tuple[int, Triangle]]
     if isinstance(source, RemoteSource):
         shift = source.first_point().astype(np.float64)
-        triangles = source.map(partial(_reduce, shift=shift), size, workers)
+        triangles = source.triangles(shift, size, workers)
     else:
         chunks = checked_chunks(source, size)
         first = next(chunks)
