@@ -100,7 +100,11 @@ def test_the_accuracy_table_is_filled_in() -> None:
 
 def test_pictures_and_pages_that_the_readme_names_are_there() -> None:
     for target in re.findall(r"\]\((?!https?:)([^)]+)\)", README):
-        assert (ROOT / target).is_file(), target
+        page, _, anchor = target.partition("#")
+        assert (ROOT / page).is_file(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", (ROOT / page).read_text(), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", h).lower().replace(" ", "-") for h in headings}
     for folder in re.findall(r"`(docker/[\w./]+)`", README):
         assert (ROOT / folder).exists(), folder
     assert Path(ROOT / "docs/images/reconstruction.png").read_bytes().startswith(b"\x89PNG")
