@@ -65,6 +65,9 @@ Key = Annotated[
 FrameOfTruth = Annotated[Frame, typer.Option(help="Frame that the ground truth is given in.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
+_OF_FILES = ("measurements_key", "ground_truth_key", "faces_key", "ground_truth_frame")
+"""Options of a job that are flags here; by ``-O`` they are taken, too."""
+
 
 def preset_and_options(
     cls: type, preset: str | None, assignments: list[str] | None
@@ -101,7 +104,14 @@ def reconstruct(
     Writes result.npz, report.json and frames/frame_0000.ply, ... into the folder; with ground truth
     it tells the error e3D.
     """
-    options = parse(Options, preset_and_options(Options, preset, option))
+    values = preset_and_options(JobOptions, preset, option)
+    given = parse(JobOptions, {name: values.pop(name) for name in _OF_FILES if name in values})
+    key = key or given.measurements_key
+    ground_truth_key = ground_truth_key or given.ground_truth_key
+    faces_key = faces_key or given.faces_key
+    if frame == "auto":
+        frame = given.ground_truth_frame
+    options = parse(Options, values)
     # All inputs are checked before the work begins.
     with _naming(file):
         measurements = open_array(file, key=key)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -258,7 +259,17 @@ def _tell(outcomes: Sequence[_Outcome]) -> None:
         if outcome.job is not None:
             table.add_row(escape(outcome.file.name), *_row(outcome.job))
     if table.row_count:
-        console.print(table)
+        _print_whole(table)
+
+
+_WIDEST = 1000
+
+
+def _print_whole(table: Table) -> None:
+    """Print a table as wide as it is: ids that are cut off cannot be copied."""
+    wide = Console(file=console.file, width=_WIDEST)
+    wide.width = max(console.width, wide.measure(table).maximum)
+    wide.print(table)
 
 
 def _row(job: Job) -> tuple[str, ...]:
@@ -296,7 +307,7 @@ def list_jobs(
     for job in found:
         created = job.created_at.astimezone().strftime("%Y-%m-%d %H:%M:%S")
         table.add_row(*_row(job), created, escape(job.name or ""))
-    console.print(table)
+    _print_whole(table)
 
 
 @jobs.command()

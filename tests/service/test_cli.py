@@ -163,6 +163,18 @@ def test_mistakes_are_told_in_a_line_and_an_exit_status(
     assert says in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
+def test_options_of_files_are_taken_as_options_too(example: Path, tmp_path: Path) -> None:
+    W = np.load(example / "measurements.npy")
+    np.savez(tmp_path / "two.npz", a=W, b=W[:, :40])
+    two = tmp_path / "two.npz"
+    assert smsr("reconstruct", two, "-o", tmp_path / "out").returncode == 3
+    text = succeeded(
+        smsr("reconstruct", two, "-O", "measurements_key=b", "-o", tmp_path / "out", "--json")
+    )
+    assert json.loads(text)["points"] == 40
+    assert smsr("reconstruct", two, "-O", "ground_truth_frame=moon").returncode == 2
+
+
 def test_the_process_ends_with_the_exit_status(tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("this is no array")
     run = smsr("reconstruct", "text.npy", cwd=tmp_path)
@@ -246,7 +258,9 @@ def test_jobs_are_looked_after(served: Served, example: Path, tmp_path: Path) ->
     shown: dict[str, Any] = json.loads(succeeded(smsr("jobs", "show", job["id"], *url)))
     assert shown["status"] == "succeeded"
     listed = succeeded(smsr("jobs", "list", "--status", "succeeded", *url))
-    assert job["id"] in listed
+    (row,) = (line for line in listed.splitlines() if job["id"] in line)
+    assert "succeeded" in row
+    assert "measurements.npy" in row
     refused = smsr("jobs", "cancel", job["id"], *url)
     assert refused.returncode == 1
     assert "finished" in refused.stderr
