@@ -424,12 +424,13 @@ def reweighted_shapes(
         Lambda relative to ``motion_scale ||P S#||_* / ||D S#||^2``, so it does not depend on
         units, frames or points; 0 for no motion term.
     coherent : bool
-        See `motion_scale`.
+        See `motion_scale`; with coherent cameras that turn fast eps is smaller, too.
     """
     problem = DepthProblem(measurements, rotations)
     first = min(_FIRST_ITERATIONS, max_iterations)
     converged = problem.minimise(first, tolerance, part_of(hook, 0.0, 1 / (_ROUNDS + 1)))
     complexity = problem.complexity()
+    offset = by_turn_speed(rotations, *_LOG_OFFSETS) if coherent else _LOG_OFFSETS[0]
     scale = 0.0
     for index in range(_ROUNDS):
         spectrum, motion = problem.spectrum(), problem.motion()
@@ -440,7 +441,7 @@ def reweighted_shapes(
         if index < _SCALED_ROUNDS and motion_weight > 0.0:
             scale = motion_weight * motion_scale(problem, coherent=coherent)
         problem.motion_weight = scale * nuclear / max(motion, 1e-12 * nuclear)
-        weights = 1.0 / (spectrum + _LOG_OFFSET * spectrum[0])
+        weights = 1.0 / (spectrum + offset * spectrum[0])
         problem.weights = weights * (nuclear / float(weights @ spectrum))
         count = left if index == _ROUNDS - 1 else min(_ITERATIONS_PER_ROUND, left)
         part = part_of(hook, (index + 1) / (_ROUNDS + 1), (index + 2) / (_ROUNDS + 1))
@@ -452,12 +453,12 @@ _FIRST_ITERATIONS = 30
 _ROUNDS = 5
 _SCALED_ROUNDS = 2
 _ITERATIONS_PER_ROUND = 40
-_LOG_OFFSET = 0.15  # eps
+_LOG_OFFSETS = (0.15, 0.05)  # eps; the second where coherent cameras turn fast
 _RIGID = 1e-6
 
 _RATIO = 15.0
 _BY_RATIO = 0.7
-_BY_HASTE = (1.0, 16.0)
+_BY_HASTE = (1.0, 21.0)
 _MOST_BY_HASTE = 2.0
 _FAST_TURN = (math.radians(1.0), math.radians(2.0))
 
@@ -485,10 +486,19 @@ def motion_scale(problem: DepthProblem, *, coherent: bool) -> float:
     if not coherent:
         return scale
     haste = 1.0 - float((steps[1:] * steps[:-1]).sum()) / motion
-    turns = np.diff(problem.rotations, axis=0)
-    speed = math.sqrt(float((turns**2).sum(axis=(1, 2)).mean()) / 2.0)
-    weight = float(np.interp(speed, _FAST_TURN, _BY_HASTE)) * haste
+    weight = by_turn_speed(problem.rotations, *_BY_HASTE) * haste
     return max(scale, min(_MOST_BY_HASTE, weight) * max(0.0, math.log(ratio)))
+
+
+def by_turn_speed(rotations: NDArray[np.float64], slow: float, fast: float) -> float:
+    """Return a value between two, by how fast cameras (T, 3, 3) turn from frame to frame.
+
+    A camera that turns fast, beside the object's own motion, sees depth from different sides in
+    neighbouring frames, and the tracks bear out more of it.
+    """
+    turns = np.diff(rotations, axis=0)
+    speed = math.sqrt(float((turns**2).sum(axis=(1, 2)).mean()) / 2.0)
+    return float(np.interp(speed, _FAST_TURN, (slow, fast)))
 
 
 def rigid_shapes(

@@ -24,7 +24,7 @@ SPARSE = {
     "pickup": 0.035,
     "stretch": 0.040,
     "yoga": 0.035,
-    "dance": 0.117,
+    "dance": 0.115,
     "dinosaur": 0.25,
 }
 DENSE = {"facecap": 0.025, "samba": 0.14}
