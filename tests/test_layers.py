@@ -12,7 +12,10 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("smsr", "worker", "service")
 
 SOLVER_LIBRARIES = {"numpy", "scipy", "threadpoolctl", "h5py"}
-OF_AN_EXTRA = {"smsr/cluster.py": {"dask", "zarr"}}
+OF_AN_EXTRA = {
+    "smsr/cluster.py": {"dask", "zarr"},
+    "smsr/devices.py": {"array_api_compat"},
+}
 WEB_LIBRARIES = {"fastapi", "starlette", "uvicorn", "httpx", "typer", "rich", "multipart"}
 
 
