@@ -7,12 +7,14 @@ columns of the centred measurements, once on the columns of their left factor, w
 the points before and the one after counted in. The last column is the largest difference between
 the shapes relative to their largest coordinate: both compute the same. On a busy machine set
 OMP_NUM_THREADS=1: threads of BLAS that wait for each other make the baseline look slow.
+``--figure FILE`` draws the growth of both.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,12 +64,33 @@ def reduced(
     return shapes, np.diff(marks).tolist()
 
 
+def draw(target: Path, frames: int, rows: list[tuple[int, float, float]]) -> None:
+    """Draw points against seconds, of the baseline and of ours, both axes logarithmic."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    points, baseline, ours = zip(*rows, strict=True)
+    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
+    axes.loglog(points, baseline, "o--", color="0.45", label="all points")
+    axes.loglog(points, ours, "s-", color="0.0", label="virtual points, both passes included")
+    axes.set_xlabel("points")
+    axes.set_ylabel("seconds")
+    axes.set_title(f"The published shape stage on {frames} frames", fontsize=11)
+    axes.grid(which="major", color="0.9")
+    axes.legend(frameon=False)
+    figure.savefig(target, dpi=100)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=51)
     parser.add_argument("--points", type=int, nargs="+", default=[10**3, 10**4, 10**5])
     parser.add_argument("--iterations", type=int, default=50)
+    parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
+    rows: list[tuple[int, float, float]] = []
     columns = ["points", "unreduced", "factorise", "shapes", "map back", "ours", "ratio"]
     print(f"{arguments.frames} frames, {arguments.iterations} iterations, seconds")
     print(*(f"{column:>10}" for column in columns), "difference")
@@ -78,12 +101,15 @@ def main() -> None:
         theirs, baseline = unreduced(W, rotations, arguments.iterations)
         difference = float(np.abs(ours - theirs).max() / np.abs(theirs).max())
         total = sum(seconds)
+        rows.append((points, baseline, total))
         print(
             f"{points:10d}",
             *(f"{value:10.3f}" for value in (baseline, *seconds, total)),
             f"{baseline / total:10.1f} {difference:10.1e}",
             flush=True,
         )
+    if arguments.figure is not None:
+        draw(arguments.figure, arguments.frames, rows)
 
 
 if __name__ == "__main__":

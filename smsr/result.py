@@ -131,9 +131,12 @@ class MovingSurface:
     translations: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        for array in (self.shapes, self.cameras, self.translations):
+        for name in ("shapes", "cameras", "translations"):
+            array = getattr(self, name)
             if isinstance(array, np.ndarray):  # a dask array is read-only by itself
                 array.flags.writeable = False
+                # A view of a read-only array cannot be made writeable again.
+                object.__setattr__(self, name, array.view())
 
     @property
     def rotations(self) -> NDArray[np.float64]:

@@ -106,6 +106,8 @@ class TestResult:
         for array in (result.shapes, result.cameras, result.translations):
             with pytest.raises(ValueError, match="read-only"):
                 array[...] = 0.0
+            with pytest.raises(ValueError, match="WRITEABLE"):
+                array.setflags(write=True)
 
     @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int32])
     def test_single_precision_stays_single(self, dtype: type) -> None:
