@@ -212,6 +212,13 @@ _OF_THE_SERVICE = (
         "`GET /v1/jobs/{id}` and the header `Prefer: wait=30`.",
     ),
     ProblemType(
+        "inputs-gone",
+        "The files of the job are gone",
+        409,
+        "The job failed because its input cannot be used, and its files were removed then.",
+        "Read the job's `problem`, correct the input or the options, and submit again.",
+    ),
+    ProblemType(
         "job-failed",
         "The job failed",
         409,

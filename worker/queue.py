@@ -27,7 +27,7 @@ from worker.records import (
     results_prefix,
     upload_prefix,
 )
-from worker.storage import ObjectStorage, StorageError
+from worker.storage import ObjectMissing, ObjectStorage, StorageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,6 +49,10 @@ _LATE_WRITER_SECONDS = 15.0
 """After a deletion a worker that has not noticed may write for a while; look again after that."""
 
 log = structlog.get_logger(__name__)
+
+
+class InputsGone(Exception):
+    """The job failed for its input, and its files were removed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,13 +165,25 @@ class JobQueue:
         ------
         JobActive
             It has not ended.
+        InputsGone
+            It failed for its input, whose files were removed then.
         """
+        record = self.records.get(job_id)
+        if record is not None and record.status == "failed":
+            self._check_inputs(record)
         outcome = self.records.retry(job_id)
         if outcome == "active":
             raise JobActive(job_id)
         if outcome == "ok":
             self.enqueue(job_id)
         return self.records.get(job_id)
+
+    def _check_inputs(self, record: JobRecord) -> None:
+        try:
+            for file in record.inputs.values():
+                self.storage.size(file.key)
+        except ObjectMissing:
+            raise InputsGone(record.id) from None
 
     def position(self, job_id: str) -> int | None:
         """Return how many jobs are ahead of a queued one, None when it is not queued."""

@@ -17,7 +17,7 @@ from redis.exceptions import RedisError
 from rq import get_current_job
 
 import smsr
-from smsr.errors import Cancelled, SmsrError
+from smsr.errors import Cancelled, InputError, SmsrError
 from smsr.files import load_faces, open_array
 from smsr.measurements import as_source
 from smsr.metrics import as_shapes
@@ -37,7 +37,7 @@ from worker.problems import (
 from worker.processes import raise_after
 from worker.progress import AttemptOver, ProgressReporter
 from worker.queue import JobQueue
-from worker.records import RecordStore, Verdict, result_prefix
+from worker.records import RecordStore, Verdict, result_prefix, upload_prefix
 from worker.settings import environment_settings
 from worker.storage import ObjectMissing, ObjectStorage, StorageError
 
@@ -268,6 +268,9 @@ class _Attempt:
         )
         if verdict is Verdict.CANCELLED:
             self._end("cancelled", lambda: self.records.stop(self.record.id, self.attempt))
+        elif verdict is Verdict.OK and isinstance(error, InputError):
+            # No other run can do better with these files.
+            self._remove(upload_prefix(self.record.id))
 
     def _give_back(self, error: StorageError) -> None:
         """Let the job be run again, here or where the storage can be reached."""
@@ -296,10 +299,14 @@ class _Attempt:
 
     def _discard(self) -> None:
         """Remove what this attempt has uploaded; maintenance does it where this fails."""
+        self._remove(self.prefix)
+
+    def _remove(self, prefix: str) -> None:
+        """Remove objects; those that cannot be removed now go by maintenance or with the job."""
         try:
-            self.storage.delete_prefix(self.prefix)
+            self.storage.delete_prefix(prefix)
         except StorageError as error:
-            log.warning("results are left for later", prefix=self.prefix, reason=str(error))
+            log.warning("objects are left for later", prefix=prefix, reason=str(error))
 
     def _with_storage(self, action: Callable[[], T]) -> T:
         """Do something with the storage, again and again for a while when it fails."""

@@ -17,6 +17,7 @@ from service.uploads import UploadLimits, discard_uploads, receive_submission
 from service.waiting import preferred_wait, wait_until_final
 from smsr.options import describe
 from worker.options import JobOptions
+from worker.queue import InputsGone
 from worker.records import JobActive, JobRecord, new_job_id
 from worker.storage import ObjectMissing
 
@@ -113,7 +114,8 @@ async def submit(request: Request, response: Response, shared: Shared) -> Job:
     The parts may come in any order. The beginning of each file is checked while it arrives, so
     most unusable files are refused at once; what only shows in the whole file (an entry that is not
     finite, a corrupt archive) makes the job fail with the same kind of problem document. Nothing of
-    a refused or broken upload is kept; the files of a job are kept until it expires or is deleted.
+    a refused or broken upload is kept; the files of a job
+    are kept until it fails for its input, expires or is deleted.
     """
     queue = shared.queue
     await to_thread.run_sync(queue.redis.ping)  # before a long upload, not after it
@@ -303,7 +305,9 @@ async def cancel_job(request: Request, response: Response, shared: Shared, job_i
     "/{job_id}/retry",
     status_code=202,
     summary="Run a finished job again",
-    responses=example_responses("unknown-job", "job-unfinished", "queue-unavailable"),
+    responses=example_responses(
+        "unknown-job", "job-unfinished", "inputs-gone", "queue-unavailable"
+    ),
 )
 async def retry_job(request: Request, shared: Shared, job_id: JobId) -> Job:
     """Queue a job that has ended once more, with the same files and options; its result goes."""
@@ -311,6 +315,10 @@ async def retry_job(request: Request, shared: Shared, job_id: JobId) -> Job:
         record = await to_thread.run_sync(shared.queue.retry, job_id)
     except JobActive:
         raise Problem("job-unfinished", "The job is still queued or running.") from None
+    except InputsGone:
+        raise Problem(
+            "inputs-gone", "The job failed for its input and keeps no files; submit it again."
+        ) from None
     if record is None:
         raise unknown_job(job_id)
     return job_document(record, root=root_of(request))
