@@ -114,8 +114,8 @@ async def submit(request: Request, response: Response, shared: Shared) -> Job:
     The parts may come in any order. The beginning of each file is checked while it arrives, so
     most unusable files are refused at once; what only shows in the whole file (an entry that is not
     finite, a corrupt archive) makes the job fail with the same kind of problem document. Nothing of
-    a refused or broken upload is kept; the files of a job
-    are kept until it fails for its input, expires or is deleted.
+    a refused or broken upload is kept; the files of a job are kept until it fails for its input,
+    expires or is deleted.
     """
     queue = shared.queue
     await to_thread.run_sync(queue.redis.ping)  # before a long upload, not after it
