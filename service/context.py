@@ -1,6 +1,6 @@
 """What the routes share: the queue, the storage and the feed of changes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import Depends, Path, Request
@@ -28,6 +28,8 @@ class Context:
         Changes of jobs, for those who wait.
     results : OpenResults
     metrics : Metrics
+    owner : str or None
+        Whose jobs this request may see and make; None where all clients share all of them.
     """
 
     settings: Settings
@@ -35,6 +37,7 @@ class Context:
     feed: ChangeFeed
     results: OpenResults
     metrics: Metrics
+    owner: str | None = None
 
     @property
     def storage(self) -> ObjectStorage:
@@ -42,15 +45,15 @@ class Context:
         return self.queue.storage
 
     async def record(self, job_id: str) -> JobRecord:
-        """Return the record of a job.
+        """Return the record of a job that this request may see.
 
         Raises
         ------
         Problem
-            There is no such job.
+            There is no such job, or it is another owner's: a client cannot tell which.
         """
         record = await self.feed.get(job_id)
-        if record is None:
+        if record is None or (self.owner is not None and record.owner != self.owner):
             raise unknown_job(job_id)
         return record
 
@@ -62,7 +65,7 @@ def unknown_job(job_id: str) -> Problem:
 
 def _context(request: Request) -> Context:
     context: Context = request.app.state.context
-    return context
+    return replace(context, owner=getattr(request.state, "owner", None))
 
 
 def _job_id(

@@ -1,6 +1,7 @@
 """Submitting, watching, cancelling and deleting jobs."""
 
 import dataclasses
+from functools import partial
 from typing import Annotated, Any
 from urllib.parse import urlencode
 
@@ -134,6 +135,7 @@ async def submit(request: Request, response: Response, shared: Shared) -> Job:
         options=dataclasses.asdict(submission.options),
         inputs={str(role): file for role, file in submission.inputs.items()},
         name=submission.inputs["measurements"].name,
+        owner=shared.owner,
         frames=submission.frames,
         points=submission.points,
     )
@@ -184,7 +186,9 @@ async def list_jobs(
 ) -> JobList:
     """Return one page of jobs. Jobs that come or go in between do not shift the pages."""
     try:
-        page = await to_thread.run_sync(shared.queue.records.list, status, cursor, limit)
+        page = await to_thread.run_sync(
+            partial(shared.queue.records.list, status, cursor, limit, owner=shared.owner)
+        )
     except ValueError:
         raise Problem(
             "invalid-request", f"query cursor: {cursor!r} was not given by a page before."
@@ -266,6 +270,7 @@ async def _whole_document(request: Request, shared: Context, record: JobRecord) 
 )
 async def delete_job(shared: Shared, job_id: JobId) -> None:
     """Remove a job, its inputs and its results; a running one is stopped."""
+    await shared.record(job_id)
     if not await to_thread.run_sync(shared.queue.delete, job_id):
         raise unknown_job(job_id)
 
@@ -311,6 +316,7 @@ async def cancel_job(request: Request, response: Response, shared: Shared, job_i
 )
 async def retry_job(request: Request, shared: Shared, job_id: JobId) -> Job:
     """Queue a job that has ended once more, with the same files and options; its result goes."""
+    await shared.record(job_id)
     try:
         record = await to_thread.run_sync(shared.queue.retry, job_id)
     except JobActive:
