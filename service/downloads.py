@@ -8,9 +8,14 @@ kept twice or held in memory, and every length is known before the first byte.
 from __future__ import annotations
 
 import asyncio
+import base64
+import hashlib
 import json
+import re
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import numpy as np
 from anyio import to_thread
@@ -18,12 +23,20 @@ from starlette.datastructures import Headers
 from starlette.responses import Response, StreamingResponse
 
 from service.archives import Member, archive_size, stream_archive
+from service.conditional import (
+    NotModified,
+    PreconditionFailed,
+    Unsatisfiable,
+    Validators,
+    wanted_range,
+)
+from service.problems import Problem
 from smsr.files.npy import HEADER_BYTES, parse_header
 from smsr.files.ply import FACE_BYTES, VERTEX_BYTES, ply_face_block, ply_header
 from worker.storage import ObjectMissing
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
+    from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
     from starlette.types import Receive, Scope, Send
 
@@ -90,6 +103,64 @@ async def read_range(
             ahead.cancel()
 
 
+@dataclass(frozen=True, slots=True)
+class Content:
+    """The bytes of a download.
+
+    Attributes
+    ----------
+    size : int
+        How many there are.
+    read : callable
+        Gives those from a position up to another.
+    seekable : bool
+        Whether `read` can begin elsewhere than at 0.
+    """
+
+    size: int
+    read: Callable[[int, int], AsyncIterator[bytes]]
+    seekable: bool = True
+
+
+def stored_content(storage: ObjectStorage, key: str, size: int, offset: int = 0) -> Content:
+    """Return `size` bytes of an object as they are."""
+    return Content(size, lambda start, stop: read_range(storage, key, offset + start, stop - start))
+
+
+def held_content(data: bytes) -> Content:
+    """Return a few bytes that are at hand."""
+
+    async def read(start: int, stop: int) -> AsyncIterator[bytes]:
+        yield data[start:stop]
+
+    return Content(len(data), read)
+
+
+def joined(parts: Sequence[Content]) -> Content:
+    """Return contents one behind the other."""
+
+    async def read(start: int, stop: int) -> AsyncIterator[bytes]:
+        for part in parts:
+            if start < min(part.size, stop):
+                async for chunk in part.read(max(start, 0), min(part.size, stop)):
+                    yield chunk
+            start, stop = start - part.size, stop - part.size
+
+    return Content(sum(part.size for part in parts), read)
+
+
+def result_validators(record: JobRecord) -> Validators:
+    """Return the validators of the files of a result: the same in every process, for ever."""
+    prefix = (record.result_prefix or "").encode()
+    finished = record.finished_at or record.created_at
+    began = record.started_at or finished
+    return Validators(
+        tag=hashlib.sha256(prefix).hexdigest()[:20],
+        modified=min(finished, time.time()),  # section 8.8.2.1: not in the future
+        dated=record.attempt == 1 or int(began) < int(finished),
+    )
+
+
 class _Cutter:
     """Cuts a stream of bytes into pieces of given lengths, one after the other."""
 
@@ -134,10 +205,8 @@ class ResultFiles:
     shapes, cameras, translations : StoredArray
     faces : StoredArray or None
         None where no faces were sent.
-    finished : float
-        Unix seconds; the time stamp of archive members.
-    tag : str
-        Different for each run of the job.
+    validators : Validators
+        Different for each run of the job; its time is the time stamp of archive members.
     """
 
     storage: ObjectStorage
@@ -145,12 +214,11 @@ class ResultFiles:
     cameras: StoredArray
     translations: StoredArray
     faces: StoredArray | None
-    finished: float
-    tag: str
+    validators: Validators
 
     @classmethod
     async def open(
-        cls, storage: ObjectStorage, prefix: str, *, faces: bool, finished: float
+        cls, storage: ObjectStorage, prefix: str, *, faces: bool, validators: Validators
     ) -> ResultFiles:
         """Look at the files under a result prefix.
 
@@ -162,9 +230,8 @@ class ResultFiles:
         names = ARRAYS if faces else ARRAYS[:3]
         opened = await asyncio.gather(*(open_array(storage, prefix + name) for name in names))
         shapes, cameras, translations, *rest = opened
-        tag = prefix.rstrip("/").rpartition("/")[2]
         faces_array = rest[0] if rest else None
-        return cls(storage, shapes, cameras, translations, faces_array, finished, tag)
+        return cls(storage, shapes, cameras, translations, faces_array, validators)
 
     @property
     def frames(self) -> int:
@@ -181,17 +248,54 @@ class ResultFiles:
         """F, the number of triangles; 0 without faces."""
         return self.faces.shape[0] if self.faces else 0
 
+    # Arrays
+
+    def arrays(self) -> dict[str, StoredArray]:
+        """Return the arrays by the names of their files."""
+        found = {
+            "shapes.npy": self.shapes,
+            "cameras.npy": self.cameras,
+            "translations.npy": self.translations,
+        }
+        if self.faces is not None:
+            found["faces.npy"] = self.faces
+        return found
+
+    def array(self, array: StoredArray, name: str) -> Download:
+        """Answer with one of the arrays, as NumPy reads it."""
+        content = stored_content(self.storage, array.key, array.size)
+        return Download(content, name=name, validators=self.validators)
+
     # One frame
 
     def frame(self, t: int, name: str) -> Download:
         """Answer with frame t as a binary little-endian PLY."""
-        return Download(
-            self.ply(t),
-            size=self.ply_size(),
-            name=name,
-            tag=self.tag,
-            media_type="application/octet-stream",
+        block = self._vertex_block
+        vertices = stored_content(
+            self.storage, self.shapes.key, block, self.shapes.offset + t * block
         )
+        content = joined([held_content(self._ply_header()), vertices, self._faces_content()])
+        return Download(content, name=name, validators=self.validators)
+
+    def _faces_content(self) -> Content:
+        """Return the triangles as a PLY holds them, made from any row on."""
+        faces = self.faces
+        if faces is None:
+            return held_content(b"")
+        row = faces.dtype.itemsize * 3
+
+        async def read(start: int, stop: int) -> AsyncIterator[bytes]:
+            first, last = start // FACE_BYTES, -(-stop // FACE_BYTES)
+            position = first * FACE_BYTES
+            rows = read_range(
+                self.storage, faces.key, faces.offset + first * row, (last - first) * row
+            )
+            async for chunk in rows:
+                block = ply_face_block(np.frombuffer(chunk, faces.dtype).reshape(-1, 3))
+                yield block[max(start - position, 0) : stop - position]
+                position += len(block)
+
+        return Content(FACE_BYTES * self.face_count, read)
 
     def _ply_header(self) -> bytes:
         return ply_header(self.points, self.face_count)
@@ -199,12 +303,6 @@ class ResultFiles:
     def ply_size(self) -> int:
         """Return the length in bytes of the PLY of any frame."""
         return len(self._ply_header()) + self._vertex_block + FACE_BYTES * self.face_count
-
-    def ply(self, frame: int) -> AsyncIterator[bytes]:
-        """Yield frame t as a binary little-endian PLY."""
-        start = self.shapes.offset + frame * self._vertex_block
-        vertices = read_range(self.storage, self.shapes.key, start, self._vertex_block)
-        return self._ply(_Cutter(vertices), self._face_blocks)
 
     @property
     def _vertex_block(self) -> int:
@@ -231,24 +329,18 @@ class ResultFiles:
 
     def archive(self, members: list[Member], name: str) -> Download:
         """Answer with a stored ZIP of `npz_members` or `ply_members`."""
+        content = Content(
+            archive_size(members),
+            lambda _start, _stop: stream_archive(members, self.validators.modified),
+            seekable=False,
+        )
         return Download(
-            stream_archive(members, self.finished),
-            size=archive_size(members),
-            name=name,
-            tag=self.tag,
-            media_type="application/zip",
+            content, name=name, validators=self.validators, media_type="application/zip"
         )
 
     def npz_members(self) -> list[Member]:
         """Return the members of result.npz, which are the stored files themselves."""
-        arrays = {
-            "shapes.npy": self.shapes,
-            "cameras.npy": self.cameras,
-            "translations.npy": self.translations,
-        }
-        if self.faces is not None:
-            arrays["faces.npy"] = self.faces
-        return [self._array_member(name, array) for name, array in arrays.items()]
+        return [self._array_member(name, array) for name, array in self.arrays().items()]
 
     def _array_member(self, name: str, array: StoredArray) -> Member:
         return Member(name, array.size, lambda: read_range(self.storage, array.key, 0, array.size))
@@ -302,7 +394,7 @@ class OpenResults:
             self._storage,
             prefix,
             faces="faces" in record.inputs,
-            finished=record.finished_at or record.created_at,
+            validators=result_validators(record),
         )
         self._opened[prefix] = files  # at the end: dictionaries keep their order
         while len(self._opened) > self._capacity:
@@ -310,47 +402,115 @@ class OpenResults:
         return files
 
 
-class Download(StreamingResponse):
-    """A file of known length, streamed; also the answer to HEAD and to If-None-Match.
+class Download(Response):
+    """A file of known length, or a range of it, streamed on conditions (RFC 9110).
 
     Parameters
     ----------
-    chunks : async iterator of bytes
-    size : int
-        Content-Length.
+    content : Content
     name : str
-        File name offered to the client; ASCII letters, digits, dots and dashes only, so that it
-        needs no quoting rules (RFC 6266, appendix D).
-    tag : str
-        Names the content: another run of the job has another tag (RFC 9110, section 8.8.3).
+        File name offered to the client.
+    validators : Validators
     media_type : str
+    sha256 : str, optional
+        Hexadecimal digest of the whole file, sent as Repr-Digest (RFC 9530).
+    inline : bool
+        Whether a browser may show it rather than save it.
     """
 
     def __init__(
-        self, chunks: AsyncIterator[bytes], *, size: int, name: str, tag: str, media_type: str
+        self,
+        content: Content,
+        *,
+        name: str,
+        validators: Validators,
+        media_type: str = "application/octet-stream",
+        sha256: str | None = None,
+        inline: bool = False,
     ) -> None:
-        headers = {
-            "Content-Length": str(size),
-            "Content-Disposition": f'attachment; filename="{name}"',
-            "ETag": f'"{tag}"',
+        headers = validators.headers | {
+            "Content-Disposition": disposition(name, inline=inline),
+            "Accept-Ranges": "bytes" if content.seekable else "none",
             # To be kept by the client alone, and asked for again: a retry makes a new result.
             "Cache-Control": "private, no-cache",
         }
-        super().__init__(chunks, media_type=media_type, headers=headers)
+        if sha256 is not None:
+            digest = base64.b64encode(bytes.fromhex(sha256)).decode()
+            headers["Repr-Digest"] = f"sha-256=:{digest}:"
+        super().__init__(media_type=media_type, headers=headers)
+        del self.headers["content-length"]
+        self._content = content
+        self._validators = validators
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send headers, and the content where it is wanted."""
-        known = Headers(scope=scope).get("if-none-match", "")
-        tags = {tag.strip().removeprefix("W/") for tag in known.split(",")}
-        if {"*", self.headers["etag"]} & tags:
-            kept = {name: self.headers[name] for name in ("etag", "cache-control")}
-            await Response(status_code=304, headers=kept)(scope, receive, send)
-        elif scope["method"] == "HEAD":
-            start = {"status": self.status_code, "headers": self.raw_headers}
+        """Answer with what the conditions and the range of the request ask for.
+
+        Raises
+        ------
+        Problem
+            A precondition fails, or the range is outside of the file.
+        """
+        headers = Headers(scope=scope)
+        content = self._content
+        size = content.size
+        try:
+            self._validators.check(headers)
+            part = None
+            # Section 14.2: a range means something with GET only.
+            if scope["method"] == "GET" and content.seekable and "range" in headers:
+                part = (
+                    wanted_range(headers, size) if self._validators.allow_range(headers) else None
+                )
+        except NotModified:
+            kept = ("etag", "last-modified", "cache-control")
+            fields = {name: self.headers[name] for name in kept}
+            await Response(status_code=304, headers=fields)(scope, receive, send)
+            return
+        except PreconditionFailed:
+            raise Problem(
+                "precondition-failed",
+                "The file is another than the one that the request names.",
+                headers=self._validators.headers,
+            ) from None
+        except Unsatisfiable:
+            raise Problem(
+                "range-not-satisfiable",
+                f"The file has {size} bytes, and the range begins behind them.",
+                headers={"Content-Range": f"bytes */{size}"} | self._validators.headers,
+                size=size,
+            ) from None
+        status = 200
+        if part is not None:
+            status = 206
+            self.headers["content-range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
+        wanted = range(size) if part is None else part
+        self.headers["content-length"] = str(len(wanted))
+        if scope["method"] == "HEAD":
+            start = {"status": status, "headers": self.raw_headers}
             await send({"type": "http.response.start", **start})
             await send({"type": "http.response.body", "body": b""})
-        else:
-            await super().__call__(scope, receive, send)
+            return
+        streamed = StreamingResponse(content.read(wanted.start, wanted.stop), status)
+        streamed.raw_headers = self.raw_headers
+        await streamed(scope, receive, send)
+
+
+_MEDIA_TYPE = re.compile(r"[A-Za-z0-9!#$&^_.+-]+/[A-Za-z0-9!#$&^_.+-]+")
+
+
+def safe_media_type(sent: str | None) -> str:
+    """Return the type that a client gave a file, or that of any bytes where it gave none."""
+    if sent is None or not _MEDIA_TYPE.fullmatch(sent):
+        return "application/octet-stream"
+    return sent
+
+
+def disposition(name: str, *, inline: bool = False) -> str:
+    """Return a Content-Disposition with a file name of any characters (RFC 6266)."""
+    kind = "inline" if inline else "attachment"
+    plain = "".join(c if c.isascii() and c.isprintable() and c not in '"\\%' else "_" for c in name)
+    extended = "" if plain == name else f"; filename*=utf-8''{quote(name, safe='')}"
+    return f'{kind}; filename="{plain}"{extended}'
 
 
 def diagnostics_of(report: bytes) -> Mapping[str, Any]:

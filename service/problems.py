@@ -136,6 +136,29 @@ _OF_THE_SERVICE = (
         "Frames count from 0; the member `frames` says how many there are.",
     ),
     ProblemType(
+        "unknown-file",
+        "The job has no such file",
+        404,
+        "The result has no such array, or no such file was sent with the job, or it is kept no "
+        "longer.",
+        "The member `inputs` of the job lists what was sent; results have faces where faces were "
+        "sent.",
+    ),
+    ProblemType(
+        "precondition-failed",
+        "The file is another than the client expects",
+        412,
+        "If-Match or If-Unmodified-Since names another version: the job was run again.",
+        "Ask without the condition for the present version.",
+    ),
+    ProblemType(
+        "range-not-satisfiable",
+        "The range is outside of the file",
+        416,
+        "Range begins behind the last byte; the member `size` says how many there are.",
+        "Ask for a range within the file. A download that has all bytes is complete.",
+    ),
+    ProblemType(
         "unknown-problem",
         "There is no such problem type",
         404,

@@ -51,6 +51,7 @@ class InputFile(BaseModel):
     bytes: int
     content_type: str | None
     sha256: str = Field(description="Hexadecimal digest of the bytes that were stored.")
+    link: str = Field(description="Path of the file; a job that failed for its input keeps none.")
 
 
 class JobProgress(BaseModel):
@@ -88,6 +89,10 @@ class JobLinks(BaseModel):
     result: str | None = Field(description="result.npz")
     frames: str | None = Field(description="ZIP of all frames as PLY")
     frame: str | None = Field(description="URI template (RFC 6570) of one frame as PLY, t from 0")
+    shapes: str | None = Field(description="shapes.npy, float32 (T, N, 3)")
+    cameras: str | None = Field(description="cameras.npy, float64 (T, 2, 3)")
+    translations: str | None = Field(description="translations.npy, float64 (T, 2)")
+    faces: str | None = Field(description="faces.npy, (F, 3), where faces were sent")
     report: str | None = Field(description="report.json")
 
 
@@ -116,6 +121,7 @@ class Job(BaseModel):
                             "content_type": "application/octet-stream",
                             "sha256": "9f86d081884c7d659a2feaa0c55ad015"
                             "a3bf4f1b2b0b822cd15d6c15b0f00a08",
+                            "link": f"{_SELF}/inputs/measurements",
                         }
                     },
                     "frames": 60,
@@ -143,6 +149,10 @@ class Job(BaseModel):
                         "result": f"{_SELF}/result.npz",
                         "frames": f"{_SELF}/frames.zip",
                         "frame": f"{_SELF}/frames/{{t}}.ply",
+                        "shapes": f"{_SELF}/shapes.npy",
+                        "cameras": f"{_SELF}/cameras.npy",
+                        "translations": f"{_SELF}/translations.npy",
+                        "faces": None,
                         "report": f"{_SELF}/report.json",
                     },
                 }
@@ -299,6 +309,7 @@ def job_document(
                 bytes=file.bytes,
                 content_type=file.content_type,
                 sha256=file.sha256,
+                link=f"{here}/inputs/{role}",
             )
             for role, file in record.inputs.items()
         },
@@ -318,6 +329,10 @@ def job_document(
             result=f"{here}/result.npz" if done else None,
             frames=f"{here}/frames.zip" if done else None,
             frame=f"{here}/frames/{{t}}.ply" if done else None,
+            shapes=f"{here}/shapes.npy" if done else None,
+            cameras=f"{here}/cameras.npy" if done else None,
+            translations=f"{here}/translations.npy" if done else None,
+            faces=f"{here}/faces.npy" if done and "faces" in record.inputs else None,
             report=f"{here}/report.json" if done else None,
         ),
     )

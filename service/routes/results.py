@@ -1,22 +1,36 @@
 """Downloading results."""
 
+from enum import StrEnum
 from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Path
 from starlette.responses import StreamingResponse
 
+from service.conditional import Validators
 from service.context import Context, JobId, Shared
-from service.downloads import Download, ResultFiles
+from service.downloads import (
+    Download,
+    ResultFiles,
+    result_validators,
+    safe_media_type,
+    stored_content,
+)
 from service.problems import Problem, example_responses
 from worker.records import JobRecord
+from worker.storage import ObjectMissing
 
 RETRY_SECONDS = 2
 """What ``Retry-After`` says while a job is queued or runs."""
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 
-_PROBLEMS = example_responses(
+_CONDITIONAL = {
+    206: {"description": "The part that Range asks for (RFC 9110, section 14)."},
+    304: {"description": "The client has this version already."},
+    **example_responses("precondition-failed", "range-not-satisfiable"),
+}
+_PROBLEMS = _CONDITIONAL | example_responses(
     "unknown-job",
     "job-unfinished",
     "job-failed",
@@ -116,9 +130,88 @@ async def get_frame(
         200: {"content": {"application/json": {"schema": {"type": "object"}}}},
         **_PROBLEMS,
     },
+    response_class=StreamingResponse,
 )
-async def get_report(shared: Shared, job_id: JobId) -> Response:
+async def get_report(shared: Shared, job_id: JobId) -> Download:
     """Return all diagnostics: stages, residuals, singular values, cautions."""
     record = await _finished(shared, job_id)
-    report = await to_thread.run_sync(shared.storage.get, f"{record.result_prefix}report.json")
-    return Response(report, media_type="application/json")
+    key = f"{record.result_prefix}report.json"
+    size = await to_thread.run_sync(shared.storage.size, key)
+    return Download(
+        stored_content(shared.storage, key, size),
+        name=f"smsr-{job_id}-report.json",
+        validators=result_validators(record),
+        media_type="application/json",
+        inline=True,
+    )
+
+
+class ArrayName(StrEnum):
+    """The arrays of a result."""
+
+    SHAPES = "shapes"
+    CAMERAS = "cameras"
+    TRANSLATIONS = "translations"
+    FACES = "faces"
+
+
+@router.get(
+    "/{array}.npy",
+    summary="One array of a result",
+    response_class=StreamingResponse,
+    responses={
+        200: _binary("application/octet-stream", "Read it with numpy.load."),
+        **_PROBLEMS,
+        **example_responses("unknown-job", "unknown-file", "invalid-request"),
+    },
+)
+async def get_array(shared: Shared, job_id: JobId, array: ArrayName) -> Download:
+    """Return an array as an NPY file, or the range of its bytes that is asked for.
+
+    `shapes` is float32 (T, N, 3), `cameras` float64 (T, 2, 3), `translations` float64 (T, 2) and
+    `faces`, where some were sent, (F, 3). A reader that knows the header can fetch single frames.
+    """
+    files = await _open(shared, job_id)
+    found = files.arrays().get(f"{array}.npy")
+    if found is None:
+        raise Problem("unknown-file", "No faces were sent with the job, so its result has none.")
+    return files.array(found, f"smsr-{job_id}-{array}.npy")
+
+
+@router.get(
+    "/inputs/{role}",
+    summary="A file as it was sent",
+    response_class=StreamingResponse,
+    responses={
+        200: _binary("application/octet-stream", "The bytes that were uploaded."),
+        **_CONDITIONAL,
+        **example_responses(
+            "unknown-job", "unknown-file", "queue-unavailable", "storage-unavailable"
+        ),
+    },
+)
+async def get_input(
+    shared: Shared,
+    job_id: JobId,
+    role: Annotated[str, Path(description="Name of the part: `measurements`, `faces`, ...")],
+) -> Download:
+    """Return an input file, under the name and of the type that it was sent with.
+
+    A job that failed for its input keeps none.
+    """
+    record = await shared.record(job_id)
+    file = record.inputs.get(role)
+    if file is None:
+        sent = ", ".join(record.inputs)
+        raise Problem("unknown-file", f"The job was not sent with a file {role!r}; it has {sent}.")
+    try:
+        size = await to_thread.run_sync(shared.storage.size, file.key)
+    except ObjectMissing:
+        raise Problem("unknown-file", "The job keeps its files no longer.") from None
+    return Download(
+        stored_content(shared.storage, file.key, size),
+        name=file.name,
+        validators=Validators(file.sha256, record.created_at, dated=True),
+        media_type=safe_media_type(file.content_type),
+        sha256=file.sha256,
+    )
