@@ -192,9 +192,9 @@ _OF_THE_SERVICE = (
         "unknown-part",
         "The body has a part that is not known",
         422,
-        "Parts are `measurements`, `ground_truth`, `faces` and `options`; nothing else is read, "
-        "and a misspelt part is refused rather than ignored.",
-        "Rename or leave out the part.",
+        "Parts are `measurements`, `ground_truth`, `faces`, `options` and the settings of a job; "
+        "nothing else is read, and a misspelt part is refused rather than ignored.",
+        "Rename or leave out the part; the member `parts` lists those that are known.",
     ),
     ProblemType(
         "duplicate-part",
@@ -210,6 +210,14 @@ _OF_THE_SERVICE = (
         "The part `options` must be one JSON object of option names and values, in UTF-8, of at "
         "most 64 KiB.",
         'Send for instance {"layout": "stacked"}. GET /v1/info lists all options.',
+    ),
+    ProblemType(
+        "invalid-setting",
+        "A setting of the job is not valid",
+        422,
+        "A part, or a member, that says how the job is to be treated has a value that is wrong or "
+        "that the service does not allow. The member `setting` names it.",
+        "Read `detail`; /docs describes every setting, and `settings` lists their names.",
     ),
     ProblemType(
         "upload-too-large",

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import re
 from contextlib import aclosing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from anyio import CancelScope, to_thread
+from anyio import CancelScope
 from multipart import (
     MultipartError,
     MultipartSegment,
@@ -27,13 +26,20 @@ from multipart import (
 )
 
 from service.problems import Problem
+from service.submissions import (
+    SETTING_BYTES,
+    SETTINGS,
+    JobSettings,
+    Submission,
+    discard_uploads,
+    read_settings,
+)
 from smsr.files import HEAD_BYTES, Beginning, check_prefix
 from smsr.measurements import check_shape
 from smsr.metrics import as_shapes
 from smsr.options import parse
 from worker.options import JobOptions
-from worker.records import InputFile, upload_key, upload_prefix
-from worker.storage import StorageError
+from worker.records import InputFile, upload_key
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator
@@ -41,21 +47,20 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from smsr.files import Role
+    from worker.settings import Settings
     from worker.storage import ObjectStorage
 
 FILES: tuple[Role, ...] = ("measurements", "ground_truth", "faces")
-PARTS = (*FILES, "options")
+PARTS = (*FILES, "options", *SETTINGS)
 
 OPTIONS_BYTES = 64 * 1024
-FRAMING_BYTES = 64 * 1024
-"""What boundaries and part headers may add to the files and the options."""
+FRAMING_BYTES = 128 * 1024
+"""What boundaries, part headers and settings may add to the files and the options."""
 
 BLOCK_BYTES = 1 << 20
 """How much is handed to the storage at once; packets are far smaller."""
 
 _NAME_LENGTH = 150
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,27 +96,12 @@ class UploadLimits:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Submission:
-    """A job as it was uploaded.
-
-    Attributes
-    ----------
-    options : JobOptions
-    inputs : dict of str to InputFile
-        By part name; 'measurements' is among them.
-    frames, points : int or None
-        T and N, where the beginning of the measurements tells them.
-    """
-
-    options: JobOptions
-    inputs: dict[Role, InputFile]
-    frames: int | None
-    points: int | None
-
-
 async def receive_submission(
-    request: Request, job_id: str, storage: ObjectStorage, limits: UploadLimits
+    request: Request,
+    job_id: str,
+    storage: ObjectStorage,
+    limits: UploadLimits,
+    operator: Settings | None = None,
 ) -> Submission:
     """Read the body of a submission and store its files.
 
@@ -123,6 +113,8 @@ async def receive_submission(
         Names the objects.
     storage : ObjectStorage
     limits : UploadLimits
+    operator : Settings, optional
+        Bounds the settings that a job may have.
 
     Raises
     ------
@@ -135,7 +127,7 @@ async def receive_submission(
     announced = request.headers.get("content-length", "")
     if announced.isdecimal() and int(announced) > limits.body_bytes:
         raise limits.too_large()
-    upload = _Upload(request, boundary, job_id, storage, limits)
+    upload = _Upload(request, boundary, job_id, storage, limits, operator)
     try:
         return await upload.receive()
     except BaseException:
@@ -143,14 +135,6 @@ async def receive_submission(
         with CancelScope(shield=True):
             await discard_uploads(storage, job_id)
         raise
-
-
-async def discard_uploads(storage: ObjectStorage, job_id: str) -> None:
-    """Remove the inputs of a job that will not be; where that fails, maintenance does it later."""
-    try:
-        await to_thread.run_sync(storage.delete_prefix, upload_prefix(job_id))
-    except StorageError:
-        _log.warning("the files of a refused upload could not be removed now", exc_info=True)
 
 
 class _Upload:
@@ -163,13 +147,17 @@ class _Upload:
         job_id: str,
         storage: ObjectStorage,
         limits: UploadLimits,
+        operator: Settings | None,
     ) -> None:
         self._request = request
         self._job_id = job_id
         self._storage = storage
         self._limits = limits
         self._left = limits.bytes
+        self._operator = operator
         self._options: JobOptions | None = None
+        self._given: dict[str, str] = {}
+        self._settings = JobSettings()
         self._inputs: dict[Role, InputFile] = {}
         self._heads: dict[Role, bytes] = {}
         try:
@@ -188,6 +176,9 @@ class _Upload:
                 role = self._role(part)
                 if role == "options":
                     self._options = parse(JobOptions, await _read_options(_body(events)))
+                elif role in SETTINGS:
+                    self._given[role] = await _read_setting(role, _body(events))
+                    self._settings = read_settings(self._given, self._operator, texts=True)
                 else:
                     await self._store(cast("Role", role), part, _body(events))
         if "measurements" not in self._inputs:
@@ -197,7 +188,8 @@ class _Upload:
                 + (f"It has {', '.join(self._inputs)}." if self._inputs else "It has no file."),
             )
         options = self._options or JobOptions()
-        return Submission(options, self._inputs, *self._check_together(options))
+        frames, points = self._check_together(options)
+        return Submission(options, self._inputs, frames, points, self._settings)
 
     async def _events(self) -> AsyncGenerator[MultipartSegment | bytes | None, None]:
         """Yield what the parser finds: a segment, its bytes, None at its end, and so on."""
@@ -237,7 +229,8 @@ class _Upload:
                 part=shown,
                 parts=list(PARTS),
             )
-        if name in self._inputs or (name == "options" and self._options is not None):
+        given = name in self._inputs or name in self._given
+        if given or (name == "options" and self._options is not None):
             raise Problem("duplicate-part", f"The part {name!r} was sent twice.", part=name)
         return name
 
@@ -325,13 +318,9 @@ async def _body(
 
 async def _read_options(body: AsyncIterator[bytes]) -> dict[str, Any]:
     """Read the part with the options."""
-    text = bytearray()
-    async for chunk in body:
-        text += chunk
-        if len(text) > OPTIONS_BYTES:
-            raise Problem(
-                "malformed-options", f"The options are longer than {OPTIONS_BYTES} bytes."
-            )
+    text = await _read_text(body, OPTIONS_BYTES)
+    if text is None:
+        raise Problem("malformed-options", f"The options are longer than {OPTIONS_BYTES} bytes.")
     try:
         values = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
     except RecursionError:
@@ -343,6 +332,28 @@ async def _read_options(body: AsyncIterator[bytes]) -> dict[str, Any]:
             "malformed-options", f"The options are a JSON {_json_type(values)}, not an object."
         )
     return values
+
+
+async def _read_setting(name: str, body: AsyncIterator[bytes]) -> str:
+    """Read a part with one setting."""
+    text = await _read_text(body, SETTING_BYTES)
+    try:
+        if text is not None:
+            return text.decode("utf-8")
+        detail = f"{name}: longer than {SETTING_BYTES} bytes."
+    except UnicodeDecodeError:
+        detail = f"{name}: not UTF-8."
+    raise Problem("invalid-setting", detail, setting=name, settings=list(SETTINGS))
+
+
+async def _read_text(body: AsyncIterator[bytes], most: int) -> bytearray | None:
+    """Read a small part whole; None where it is larger."""
+    text = bytearray()
+    async for chunk in body:
+        text += chunk
+        if len(text) > most:
+            return None
+    return text
 
 
 def _no_constant(name: str) -> object:

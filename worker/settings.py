@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from pathlib import Path
 
 from pydantic import AliasChoices, Field
@@ -58,6 +59,12 @@ class Settings(BaseSettings):
     )
     result_ttl_seconds: float = Field(
         default=7 * DAY, ge=0, description="How long a finished job is kept; 0 keeps it for ever."
+    )
+    max_ttl_seconds: float = Field(
+        default=30 * DAY,
+        ge=0,
+        description="Longest time for which a job may ask to be kept; 0 sets no limit. A job may "
+        "always ask for `result_ttl_seconds`.",
     )
     orphan_grace_seconds: float = Field(
         default=DAY,
@@ -120,6 +127,13 @@ class Settings(BaseSettings):
     def threads_per_worker(self) -> int:
         """Number of BLAS threads of one worker."""
         return self.threads or max(1, available_cores() // self.workers)
+
+    @property
+    def longest_ttl(self) -> float:
+        """Longest time to live in seconds that a job may ask for; infinite for no limit."""
+        if not (self.max_ttl_seconds and self.result_ttl_seconds):
+            return math.inf
+        return max(self.max_ttl_seconds, self.result_ttl_seconds)
 
     def time_limit(self, asked: float | None) -> float:
         """Return the seconds that a job may run which asked for some, or for nothing."""

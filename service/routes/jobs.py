@@ -1,20 +1,19 @@
 """Submitting, watching, cancelling and deleting jobs."""
 
-import dataclasses
 from functools import partial
 from typing import Annotated, Any
 from urllib.parse import urlencode
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
-from redis.exceptions import RedisError
 from starlette.requests import ClientDisconnect
 
 from service.context import Context, JobId, Shared, root_of, unknown_job
 from service.downloads import diagnostics_of
 from service.problems import Problem, example_responses
 from service.schemas import Job, JobList, JobStatus, job_document
-from service.uploads import UploadLimits, discard_uploads, receive_submission
+from service.submissions import accept, settings_schema
+from service.uploads import UploadLimits, receive_submission
 from service.waiting import preferred_wait, wait_until_final
 from smsr.options import describe
 from worker.options import JobOptions
@@ -68,6 +67,7 @@ _BODY = {
                             "True 3D points, (T, N, 3) or (3T, N): the result gets its e3D."
                         ),
                         "faces": _file("Triangles, (F, 3) point numbers from 0: results get them."),
+                        **settings_schema(),
                     },
                 },
                 "encoding": {"options": {"contentType": "application/json"}},
@@ -98,6 +98,7 @@ _BODY = {
             "malformed-options",
             "unknown-option",
             "invalid-option",
+            "invalid-setting",
             "odd-row-count",
             "too-few-frames",
             "too-few-points",
@@ -127,36 +128,14 @@ async def submit(request: Request, response: Response, shared: Shared) -> Job:
             job_id,
             shared.storage,
             UploadLimits(shared.settings.max_upload_bytes, shared.settings.max_array_bytes),
+            shared.settings,
         )
     except ClientDisconnect:
         raise Problem("malformed-multipart", "The client went away.") from None
-    record = JobRecord.new(
-        job_id,
-        options=dataclasses.asdict(submission.options),
-        inputs={str(role): file for role, file in submission.inputs.items()},
-        name=submission.inputs["measurements"].name,
-        owner=shared.owner,
-        frames=submission.frames,
-        points=submission.points,
-    )
-    record = await _enqueue(shared, record)
+    record = await accept(shared, job_id, submission)
     document = job_document(record, root=root_of(request))
     response.headers["Location"] = document.links.self
     return document
-
-
-async def _enqueue(shared: Context, record: JobRecord) -> JobRecord:
-    """Make a stored upload a job; Redis may go away at any moment."""
-    try:
-        return await to_thread.run_sync(shared.queue.submit, record)
-    except RedisError:
-        # A record without a place in the queue gets one by maintenance: it is accepted. Where not
-        # even that can be seen now, the files stay until maintenance knows whether there is one.
-        accepted = await to_thread.run_sync(shared.queue.records.get, record.id)
-        if accepted is not None:
-            return accepted
-        await discard_uploads(shared.storage, record.id)
-        raise
 
 
 @router.get(

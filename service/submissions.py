@@ -1,0 +1,194 @@
+"""What a client may say about a job, and how a submission becomes a job.
+
+A job is submitted as a multipart body (`service.uploads`) or as a JSON document that names finished
+uploads; either way it has solver options (`worker.options.JobOptions`) and `JobSettings`, which say
+how the job is to be treated. Each setting is a part of its own in the one form and a member in the
+other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from anyio import to_thread
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic_core import PydanticCustomError
+from redis.exceptions import RedisError
+
+from service.problems import Problem
+from worker.records import JobRecord, upload_prefix
+from worker.settings import Settings
+from worker.storage import StorageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pydantic import ValidationInfo
+
+    from service.context import Context
+    from smsr.files import Role
+    from worker.options import JobOptions
+    from worker.records import InputFile
+    from worker.storage import ObjectStorage
+
+_log = logging.getLogger(__name__)
+
+Priority = Literal["high", "normal", "low"]
+
+LABEL_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+"""Of a batch; a label is a part of paths and of file names as it is."""
+
+Label = Annotated[str, Field(pattern=LABEL_PATTERN, max_length=64)]
+
+SETTING_BYTES = 4096
+"""Largest part of a multipart body that holds one setting."""
+
+
+class JobSettings(BaseModel):
+    """How a job is to be treated; nothing here changes its result.
+
+    Validated with the `Settings` of the operator as context, which bound what may be asked for.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    batch: Label | None = Field(
+        default=None,
+        description="Label of the batch that the job belongs to.",
+        examples=["walk-17"],
+    )
+    priority: Priority = Field(
+        default="normal",
+        description="Jobs of a higher priority start first; those of one priority in their order.",
+    )
+    ttl: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = Field(
+        default=None,
+        description="Seconds that the job is kept after it has ended; 0 keeps it for ever, where "
+        "the service allows that. Without it the service's own time holds.",
+        examples=[86400],
+    )
+    reuse: bool = Field(
+        default=True,
+        description="Whether the finished result of an equal job, one with the same files and "
+        "options, may be taken. `false` makes a new run.",
+    )
+
+    @field_validator("ttl")
+    @classmethod
+    def _within_bounds(cls, ttl: float | None, info: ValidationInfo) -> float | None:
+        operator = info.context
+        if ttl is not None and isinstance(operator, Settings):
+            longest = operator.longest_ttl
+            if (ttl or float("inf")) > longest:
+                raise PydanticCustomError(
+                    "ttl_too_long", "the service keeps jobs for at most {most} s", {"most": longest}
+                )
+        return ttl
+
+
+SETTINGS = tuple(JobSettings.model_fields)
+"""Names of the settings: parts of a multipart body, members of a JSON document."""
+
+
+def settings_schema() -> dict[str, Any]:
+    """Return the JSON Schemas of the settings by name, without the null of those not given."""
+    schema = JobSettings.model_json_schema()["properties"]
+    properties: dict[str, Any] = {}
+    for name, described in schema.items():
+        known = {k: v for k, v in described.items() if k not in ("title", "anyOf")}
+        for choice in described.get("anyOf", ()):
+            if choice != {"type": "null"}:
+                known |= choice
+        if known.get("default", 0) is None:
+            del known["default"]
+        properties[name] = known
+    return properties
+
+
+def read_settings(
+    values: Mapping[str, Any], operator: Settings | None = None, *, texts: bool = False
+) -> JobSettings:
+    """Read settings as a client gave them.
+
+    Parameters
+    ----------
+    values : mapping of str to object
+        By name.
+    operator : Settings, optional
+        Bounds what may be asked for.
+    texts : bool
+        The values are texts, as in a multipart body, not JSON values.
+
+    Raises
+    ------
+    Problem
+        invalid-setting, which names the first setting at fault.
+    """
+    try:
+        if texts:
+            return JobSettings.model_validate_strings(dict(values), context=operator)
+        return JobSettings.model_validate(dict(values), context=operator, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        name = str(first["loc"][0]) if first["loc"] else ""
+        raise Problem(
+            "invalid-setting", f"{name}: {first['msg']}.", setting=name, settings=list(SETTINGS)
+        ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """A job as it was asked for, with its files stored.
+
+    Attributes
+    ----------
+    options : JobOptions
+    inputs : dict of str to InputFile
+        By part name; 'measurements' is among them.
+    frames, points : int or None
+        T and N, where the beginning of the measurements tells them.
+    settings : JobSettings
+    """
+
+    options: JobOptions
+    inputs: dict[Role, InputFile]
+    frames: int | None
+    points: int | None
+    settings: JobSettings = field(default_factory=JobSettings)
+
+
+async def accept(shared: Context, job_id: str, submission: Submission) -> JobRecord:
+    """Make a submission a job of this request's owner; Redis may go away at any moment.
+
+    Where there is no job in the end, the files are removed.
+    """
+    record = JobRecord.new(
+        job_id,
+        options=dataclasses.asdict(submission.options),
+        inputs={str(role): file for role, file in submission.inputs.items()},
+        name=submission.inputs["measurements"].name,
+        owner=shared.owner,
+        frames=submission.frames,
+        points=submission.points,
+    )
+    try:
+        return await to_thread.run_sync(shared.queue.submit, record)
+    except RedisError:
+        # A record without a place in the queue gets one by maintenance: it is accepted. Where not
+        # even that can be seen now, the files stay until maintenance knows whether there is one.
+        accepted = await to_thread.run_sync(shared.queue.records.get, record.id)
+        if accepted is not None:
+            return accepted
+        await discard_uploads(shared.storage, record.id)
+        raise
+
+
+async def discard_uploads(storage: ObjectStorage, job_id: str) -> None:
+    """Remove the inputs of a job that will not be; where that fails, maintenance does it later."""
+    try:
+        await to_thread.run_sync(storage.delete_prefix, upload_prefix(job_id))
+    except StorageError:
+        _log.warning("the files of a refused upload could not be removed now", exc_info=True)
