@@ -38,7 +38,13 @@ class Maintenance:
 
     def run_once(self) -> None:
         """Do all that is due; failures of Redis or of the storage are left for the next time."""
-        for part in (self.queue.recover, self.expire, self.collect_garbage, self.collect_orphans):
+        for part in (
+            self.queue.recover,
+            self.expire,
+            self.queue.records.lapse_holds,
+            self.collect_garbage,
+            self.collect_orphans,
+        ):
             try:
                 part()
             except (RedisError, StorageError) as error:

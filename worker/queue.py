@@ -20,10 +20,13 @@ from rq.serializers import JSONSerializer
 from worker.connections import connect
 from worker.problems import WorkerLost, problem_document
 from worker.records import (
+    ANY,
     PREFIX,
+    Allowance,
     JobActive,
     JobRecord,
     RecordStore,
+    TooManyJobs,
     results_prefix,
     upload_prefix,
 )
@@ -111,15 +114,27 @@ class JobQueue:
 
     # For the service
 
-    def submit(self, record: JobRecord) -> JobRecord:
+    def submit(
+        self, record: JobRecord, allowance: Allowance = ANY, uploads: Sequence[str] = ()
+    ) -> JobRecord:
         """Accept a job whose inputs are stored, and return its record as it is now.
+
+        Parameters
+        ----------
+        record : JobRecord
+        allowance : Allowance
+            What its owner may have.
+        uploads : sequence of str
+            Ids of the finished uploads that its inputs were, if they were such.
 
         Raises
         ------
         JobExists
             There is a job of this id.
+        TooManyJobs, TooManyBytes
+            The owner may not have another one.
         """
-        self.records.create(record)
+        self.records.create(record, allowance, uploads)
         self.enqueue(record.id)
         return self.records.get(record.id) or record
 
@@ -158,22 +173,26 @@ class JobQueue:
                 log.warning("objects are left for later", prefix=prefix, reason=str(error))
         return True
 
-    def retry(self, job_id: str) -> JobRecord | None:
+    def retry(self, job_id: str, allowance: Allowance = ANY) -> JobRecord | None:
         """Run a job that has ended once more; None when there is none.
 
         Raises
         ------
         JobActive
             It has not ended.
+        TooManyJobs
+            Its owner may not have another active one.
         InputsGone
             It failed for its input, whose files were removed then.
         """
         record = self.records.get(job_id)
         if record is not None and record.status == "failed":
             self._check_inputs(record)
-        outcome = self.records.retry(job_id)
+        outcome = self.records.retry(job_id, allowance)
         if outcome == "active":
             raise JobActive(job_id)
+        if outcome == "busy":
+            raise TooManyJobs(job_id)
         if outcome == "ok":
             self.enqueue(job_id)
         return self.records.get(job_id)

@@ -49,6 +49,34 @@ class JobActive(Exception):
     """The job is queued or running, and the step needs one that has ended."""
 
 
+class TooManyJobs(Exception):
+    """The owner has as many queued and running jobs as it may."""
+
+
+class TooManyBytes(Exception):
+    """The owner stores as much as it may."""
+
+
+@dataclass(frozen=True, slots=True)
+class Allowance:
+    """What an owner may have at a time; None for any number.
+
+    Attributes
+    ----------
+    jobs : int or None
+        Queued and running jobs.
+    bytes : int or None
+        Inputs, uploads under way and results, together.
+    """
+
+    jobs: int | None = None
+    bytes: int | None = None
+
+
+ANY = Allowance()
+"""No limits."""
+
+
 class Verdict(StrEnum):
     """Whether an attempt may go on.
 
@@ -397,15 +425,75 @@ class RecordStore:
         seconds, microseconds = self.redis.time()
         return seconds + microseconds / 1e6
 
+    # What owners take
+
+    def active(self, owner: str) -> int:
+        """Return the number of queued and running jobs of an owner."""
+        counts = self.count(owner)
+        return counts["queued"] + counts["running"]
+
+    def stored_bytes(self, owner: str) -> int:
+        """Return the bytes of an owner's inputs, results and uploads under way."""
+        return int(cast("bytes | None", self.redis.hget(f"{PREFIX}:stored", owner)) or 0)
+
+    def hold(
+        self, upload_id: str, owner: str, size: int, *, most: int | None, seconds: float
+    ) -> None:
+        """Count an upload under way as stored, until it is dropped, lapses or becomes a job.
+
+        Doing it again for the same upload sets its bytes and its time anew.
+
+        Parameters
+        ----------
+        upload_id : str
+            That of the upload, or of the job that it will be.
+        owner : str
+        size : int
+            Bytes of the upload: in all where that is known, else so far.
+        most : int or None
+            Bytes that the owner may store.
+        seconds : float
+            How long its files will stay when nothing more is heard of it.
+
+        Raises
+        ------
+        TooManyBytes
+            It does not fit; what was held for it before stays held.
+        """
+        limit = "" if most is None else most
+        if self._step("hold", upload_id, owner, size, limit, seconds) != b"ok":
+            raise TooManyBytes(owner)
+
+    def drop_hold(self, upload_id: str) -> None:
+        """Count an upload no longer: its files are gone."""
+        self._step("drop_hold", upload_id)
+
+    def lapse_holds(self) -> int:
+        """Drop the holds whose time has passed, up to a hundred; return how many there were."""
+        return int(self._step("lapse", "*"))
+
     # The client's steps
 
-    def create(self, record: JobRecord) -> None:
+    def create(
+        self, record: JobRecord, allowance: Allowance = ANY, uploads: Sequence[str] = ()
+    ) -> None:
         """Store a new record as queued.
+
+        Parameters
+        ----------
+        record : JobRecord
+        allowance : Allowance
+            What its owner may have, this job included.
+        uploads : sequence of str
+            Ids of uploads whose files became those of the job; they are held no longer, nor is an
+            upload of the job's own id.
 
         Raises
         ------
         JobExists
             There is a record of this id.
+        TooManyJobs, TooManyBytes
+            The owner may not have another one.
         """
         fields: dict[str, str | int] = {
             "options": _encode(record.options),
@@ -417,8 +505,18 @@ class RecordStore:
                 fields[name] = value
         flat = [part for item in fields.items() for part in item]
         owner = record.owner or ""
-        if self._step("create", record.id, owner, uuid.uuid4().hex, *flat) != b"ok":
-            raise JobExists(record.id)
+        limits = ("" if n is None else n for n in (allowance.jobs, allowance.bytes))
+        size = sum(file.bytes for file in record.inputs.values())
+        nonce = uuid.uuid4().hex
+        match self._step(
+            "create", record.id, owner, nonce, *limits, size, ",".join(uploads), *flat
+        ):
+            case b"exists":
+                raise JobExists(record.id)
+            case b"busy":
+                raise TooManyJobs(owner)
+            case b"full":
+                raise TooManyBytes(owner)
 
     def assign_ticket(self, job_id: str, ticket: str) -> str | None:
         """Note the RQ job that carries this job; return the one it replaces, '' for none.
@@ -435,9 +533,16 @@ class RecordStore:
         outcome, *ticket = self._step("cancel", job_id, self.result_ttl)
         return outcome.decode(), ticket[0].decode() if ticket else ""
 
-    def retry(self, job_id: str) -> Literal["ok", "active", "gone"]:
-        """Make a finished job queued again."""
-        return cast("Literal['ok', 'active', 'gone']", self._step("retry", job_id).decode())
+    def retry(
+        self, job_id: str, allowance: Allowance = ANY
+    ) -> Literal["ok", "active", "busy", "gone"]:
+        """Make a finished job queued again; 'busy' where its owner has too many active ones."""
+        most = "" if allowance.jobs is None else allowance.jobs
+        return cast("Literal['ok']", self._step("retry", job_id, most).decode())
+
+    def forget_inputs(self, job_id: str) -> None:
+        """Note that the files of a job's inputs are gone."""
+        self._step("forget_inputs", job_id)
 
     def delete(
         self, job_id: str, *, only_expired: bool = False, again: float = 0
@@ -512,6 +617,7 @@ class RecordStore:
         points: int,
         timings: Mapping[str, float],
         metrics: Mapping[str, Any] | None = None,
+        result_bytes: int = 0,
     ) -> Verdict:
         """Make the results of an attempt those of the job, in one step."""
         fields: list[str | int] = ["frames", frames, "points", points, "timings", _encode(timings)]
@@ -524,6 +630,7 @@ class RecordStore:
             job_id,
             attempt,
             result_prefix(job_id, attempt),
+            result_bytes,
             self.result_ttl,
             _encode(stages),
             *fields,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from pathlib import Path
+from typing import Literal
 
 from pydantic import AliasChoices, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -109,6 +110,39 @@ class Settings(BaseSettings):
     )
     lost_ticket_seconds: float = Field(
         default=4, gt=0, description="Time a queued job may be without a place in RQ."
+    )
+
+    access: Literal["auto", "open", "keys"] = Field(
+        default="auto",
+        description="Who may use the API: 'keys' is whoever has an API key, 'open' whoever reaches "
+        "it; 'auto' is open to this machine where the API listens on a loopback address, else "
+        "'keys'.",
+    )
+    key_requests_per_minute: int = Field(
+        default=600, ge=0, le=100_000, description="Of an API key that says no other; 0 for any."
+    )
+    key_jobs: int = Field(
+        default=1000,
+        ge=0,
+        description="Queued and running jobs of the owner of an API key that says no other; 0 for "
+        "any number.",
+    )
+    key_stored_bytes: int = Field(
+        default=100 * GIBIBYTE,
+        ge=0,
+        description="Bytes that the owner of an API key that says no other may store; 0 for any.",
+    )
+    metrics_token: str | None = Field(
+        default=None,
+        min_length=16,
+        repr=False,
+        description="Bearer token for /metrics; without one it is open where the API is, and "
+        "closed where keys are needed.",
+    )
+    cors_origins: str = Field(
+        default="",
+        pattern=r"^(https?://[^\s,/]+(\s*,\s*https?://[^\s,/]+)*)?$",
+        description="Origins whose pages may use the API, with commas, as https://a.example.org.",
     )
 
     log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR|CRITICAL)$")

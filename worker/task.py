@@ -226,9 +226,11 @@ class _Attempt:
         report = json.loads(report_path.read_text(encoding="utf-8"))
         report |= {"metrics": metrics, "timings": self.timings}
         report_path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        stored = 0
         for name in RESULTS:
             path = self.folder / name
             if path.exists():
+                stored += path.stat().st_size
                 upload = partial(self.storage.put_file, self.prefix + name, path, move=True)
                 self._with_storage(upload)
         self.timings["publishing"] = time.perf_counter() - started
@@ -242,6 +244,7 @@ class _Attempt:
                 points=report["points"],
                 timings=self.timings,
                 metrics=metrics,
+                result_bytes=stored,
             ),
         )
         if verdict is Verdict.CANCELLED:
@@ -271,6 +274,7 @@ class _Attempt:
         elif verdict is Verdict.OK and isinstance(error, InputError):
             # No other run can do better with these files.
             self._remove(upload_prefix(self.record.id))
+            _insist(lambda: self.records.forget_inputs(self.record.id))
 
     def _give_back(self, error: StorageError) -> None:
         """Let the job be run again, here or where the storage can be reached."""

@@ -10,6 +10,9 @@
 --   leases                       sorted set of running ids by the end of their lease
 --   expiry                       sorted set of finished ids by the end of their time to live
 --   garbage                      sorted set of storage prefixes by the time they are to be removed
+--   stored                       hash: bytes that each owner's jobs and holds take
+--   hold:{id}                    hash: owner and bytes of an upload under way
+--   holds                        sorted set of ids of holds by the time they lapse
 --   counters                     hash: counts of all jobs (`worker.counters`, which also gives the
 --                                `bounds` of histograms and the `sizes` of jobs used here)
 --   changed:{id}                 channel: the record's version at every visible change
@@ -24,6 +27,7 @@ local prefix, step, id = KEYS[1] .. ':', ARGV[1], ARGV[2]
 local record = prefix .. 'job:' .. id
 local leases, expiry, garbage = prefix .. 'leases', prefix .. 'expiry', prefix .. 'garbage'
 local counters = prefix .. 'counters'
+local stored, holds = prefix .. 'stored', prefix .. 'holds'
 
 local time = redis.call('TIME')
 local now = tonumber(time[1]) + tonumber(time[2]) / 1e6
@@ -59,6 +63,46 @@ local function set_status(job, to)
     redis.call('ZADD', index, created, job)
   end
   redis.call('HSET', key, 'status', to)
+end
+
+-- Adds to what an owner stores; jobs and uploads without an owner are not counted.
+local function add_stored(owner, bytes)
+  if owner and owner ~= '' and bytes ~= 0 then
+    if redis.call('HINCRBY', stored, owner, bytes) == 0 then
+      redis.call('HDEL', stored, owner)
+    end
+  end
+end
+
+-- Sets what the inputs or the result of a job take ('input_bytes', 'result_bytes'). The record
+-- says what its owner was charged, so that exactly this is taken off again.
+local function charge(job, what, bytes)
+  local key = prefix .. 'job:' .. job
+  add_stored(read(key, 'owner'), bytes - (tonumber(read(key, what)) or 0))
+  redis.call('HSET', key, what, bytes)
+end
+
+local function drop_hold(upload)
+  local key = prefix .. 'hold:' .. upload
+  local owner, bytes = unpack(redis.call('HMGET', key, 'owner', 'bytes'))
+  if owner then
+    add_stored(owner, -bytes)
+    redis.call('DEL', key)
+    redis.call('ZREM', holds, upload)
+  end
+end
+
+-- Whether an owner stores as much as the limit ('' for none) or more, once some bytes are added.
+local function too_much(owner, bytes, limit)
+  return limit ~= '' and owner ~= '' and bytes > 0
+    and (tonumber(redis.call('HGET', stored, owner)) or 0) + bytes > tonumber(limit)
+end
+
+-- Whether an owner has as many queued and running jobs as the limit ('' for none) or more.
+local function too_many(owner, limit)
+  return limit ~= '' and owner ~= ''
+    and redis.call('ZCARD', prefix .. 'jobs@' .. owner .. ':queued')
+      + redis.call('ZCARD', prefix .. 'jobs@' .. owner .. ':running') >= tonumber(limit)
 end
 
 local function discard_results(job, first, last)
@@ -168,15 +212,31 @@ end
 
 local steps = {}
 
--- owner, nonce, then field, value, ... -> 'ok' | 'exists'
-function steps.create(owner, nonce, ...)
+-- owner, nonce, most active jobs and stored bytes of the owner ('' for any), bytes of the inputs, ids
+-- of the uploads (with commas) whose holds end as this job begins, then field, value, ...
+-- -> 'ok' | 'exists' | 'busy' | 'full'
+function steps.create(owner, nonce, most_jobs, most_bytes, bytes, uploads, ...)
   local known = read(record, 'nonce')
   if known then
     return known == nonce and 'ok' or 'exists'
   end
+  if too_many(owner, most_jobs) then
+    return 'busy'
+  end
+  local held = 0
+  for upload in (id .. ',' .. uploads):gmatch('[^,]+') do
+    held = held + (tonumber(read(prefix .. 'hold:' .. upload, 'bytes')) or 0)
+  end
+  if too_much(owner, bytes - held, most_bytes) then
+    return 'full'
+  end
+  for upload in (id .. ',' .. uploads):gmatch('[^,]+') do
+    drop_hold(upload)
+  end
   redis.call('HSET', record, 'status', 'queued', 'created_at', stamp(now),
     'queued_at', stamp(now), 'owner', owner, 'nonce', nonce, 'attempt', 0, 'lost_attempts', 0,
     ...)
+  charge(id, 'input_bytes', tonumber(bytes))
   for _, status in ipairs({ '', ':queued' }) do
     for _, index in ipairs(indices(owner, status)) do
       redis.call('ZADD', index, stamp(now), id)
@@ -254,14 +314,15 @@ function steps.progress(attempt, progress, lease, frames, points)
   return answer
 end
 
--- attempt, result prefix, ttl, seconds by stage (JSON), then field, value, ... -> verdict
-function steps.publish(attempt, result_prefix, ttl, stages, ...)
+-- attempt, result prefix, its bytes, ttl, seconds by stage (JSON), then field, value, ... -> verdict
+function steps.publish(attempt, result_prefix, bytes, ttl, stages, ...)
   if read(record, 'status') == 'succeeded' and read(record, 'attempt') == attempt then
     return 'ok'
   end
   local answer = verdict(attempt)
   if answer == 'ok' then
     redis.call('HSET', record, 'result_prefix', result_prefix, ...)
+    charge(id, 'result_bytes', tonumber(bytes))
     for stage, seconds in pairs(cjson.decode(stages)) do
       observe('stage:' .. stage, seconds)
     end
@@ -375,8 +436,8 @@ function steps.cancel(ttl)
   return { status and 'finished' or 'gone' }
 end
 
--- -> 'ok' | 'active' | 'gone'
-function steps.retry()
+-- most active jobs of the owner ('' for any) -> 'ok' | 'active' | 'busy' | 'gone'
+function steps.retry(most_jobs)
   local status = read(record, 'status')
   if not status then
     return 'gone'
@@ -384,7 +445,11 @@ function steps.retry()
   if status == 'queued' or status == 'running' then
     return 'active'
   end
+  if too_many(read(record, 'owner'), most_jobs) then
+    return 'busy'
+  end
   discard_results(id, 1, tonumber(read(record, 'attempt')))
+  charge(id, 'result_bytes', 0)
   redis.call('HDEL', record, 'problem', 'metrics', 'timings', 'result_prefix', 'progress',
     'started_at', 'finished_at', 'expires_at')
   redis.call('HSET', record, 'lost_attempts', 0, 'queued_at', stamp(now))
@@ -419,12 +484,51 @@ function steps.delete(only_expired, again)
   end
   redis.call('ZREM', leases, id)
   redis.call('ZREM', expiry, id)
+  charge(id, 'input_bytes', 0)
+  charge(id, 'result_bytes', 0)
   redis.call('DEL', record)
   for _, folder in ipairs({ 'uploads/', 'results/' }) do
     redis.call('ZADD', garbage, stamp(now + again), folder .. id .. '/')
   end
   redis.call('PUBLISH', prefix .. 'changed:' .. id, 'deleted')
   return { 'ok', ticket }
+end
+
+-- -> 'ok'; the files of the job's inputs are gone, the record stays
+function steps.forget_inputs()
+  if read(record, 'status') then
+    charge(id, 'input_bytes', 0)
+  end
+  return 'ok'
+end
+
+-- id is that of an upload; owner, its bytes so far or in all, most stored bytes of the owner ('' for
+-- any), seconds until it lapses -> 'ok' | 'full' (and what was held stays held)
+function steps.hold(owner, bytes, most_bytes, seconds)
+  local key = prefix .. 'hold:' .. id
+  local more = bytes - (tonumber(read(key, 'bytes')) or 0)
+  if too_much(owner, more, most_bytes) then
+    return 'full'
+  end
+  add_stored(owner, more)
+  redis.call('HSET', key, 'owner', owner, 'bytes', bytes)
+  redis.call('ZADD', holds, stamp(now + seconds), id)
+  return 'ok'
+end
+
+-- id is that of an upload that is given up -> 'ok'
+function steps.drop_hold()
+  drop_hold(id)
+  return 'ok'
+end
+
+-- id is '*' -> number of holds that have lapsed
+function steps.lapse()
+  local due = redis.call('ZRANGEBYSCORE', holds, '-inf', stamp(now), 'LIMIT', 0, 100)
+  for _, upload in ipairs(due) do
+    drop_hold(upload)
+  end
+  return #due
 end
 
 return steps[step](unpack(ARGV, 3))
