@@ -13,7 +13,7 @@ import hmac
 import re
 import secrets
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from worker.records import PREFIX
 
@@ -97,7 +97,7 @@ class KeyStore:
                 "underscores, with a letter or a digit first"
             )
         key_id, secret = secrets.token_hex(6), secrets.token_hex(32)
-        seconds, microseconds = cast("tuple[int, int]", self._redis.time())
+        seconds, microseconds = self._redis.time()
         key = ApiKey(
             id=key_id,
             owner=owner,
@@ -107,7 +107,7 @@ class KeyStore:
             jobs=jobs,
             stored_bytes=stored_bytes,
         )
-        fields: dict[str, str | float] = {
+        fields: dict[Any, str | float] = {
             "owner": owner,
             "created_at": f"{key.created_at:.6f}",
             "note": note,
@@ -117,7 +117,7 @@ class KeyStore:
             if (limit := getattr(key, name)) is not None:
                 fields[name] = limit
         with self._redis.pipeline() as pipe:
-            pipe.hset(_place(key_id), mapping=cast("dict[str | bytes, str | float]", fields))
+            pipe.hset(_place(key_id), mapping=fields)
             pipe.zadd(_INDEX, {key_id: key.created_at})
             pipe.execute()
         return key, f"smsr_{key_id}_{secret}"
@@ -129,7 +129,9 @@ class KeyStore:
             for key_id in ids:
                 pipe.hgetall(_place(key_id))
             found = pipe.execute()
-        return [_decode(key_id, fields) for key_id, fields in zip(ids, found, strict=True) if fields]
+        return [
+            _decode(key_id, fields) for key_id, fields in zip(ids, found, strict=True) if fields
+        ]
 
     def revoke(self, key_id: str) -> bool:
         """Remove a key, which no request can use from now on; return whether there was one."""

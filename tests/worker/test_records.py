@@ -39,8 +39,12 @@ def store(redis_process: RedisProcess, redis_url: str) -> RecordStore:
     return RecordStore(redis_process.client(), result_ttl=3600)
 
 
+INPUT = InputFile("uploads/x/measurements", "tracks.npy", 100, "ab")
+RESULT_BYTES = 1000
+
+
 def new(**fields: object) -> JobRecord:
-    record = JobRecord.new(options={"preset": "paper"}, inputs={})
+    record = JobRecord.new(options={"preset": "paper"}, inputs={"measurements": INPUT})
     return dataclasses.replace(record, **fields)  # type: ignore[arg-type]
 
 
@@ -58,7 +62,12 @@ def begun(store: RecordStore, job_id: str, worker: str = "ann", ticket: str = "t
 
 def published(store: RecordStore, job_id: str, attempt: int) -> Verdict:
     return store.publish(
-        job_id, attempt, frames=3, points=4, timings={"cameras": 0.5, "total": 1.5}
+        job_id,
+        attempt,
+        frames=3,
+        points=4,
+        timings={"cameras": 0.5, "total": 1.5},
+        result_bytes=RESULT_BYTES,
     )
 
 
@@ -555,6 +564,13 @@ class Lives(RuleBasedStateMachine):
         assert self.redis.zcard(f"{PREFIX}:leases") == len(self.running)
         for job in self.running:
             assert self.redis.zscore(f"{PREFIX}:leases", job) is not None
+
+    @invariant()
+    def what_an_owner_stores_is_what_its_jobs_have(self) -> None:
+        jobs = self.store.list(limit=1000, owner="me").records
+        expected = sum(INPUT.bytes + RESULT_BYTES * (j.status == "succeeded") for j in jobs)
+        assert self.store.stored_bytes("me") == expected
+        assert set(self.redis.hkeys(f"{PREFIX}:stored")) <= {b"me"}
 
     @invariant()
     def each_end_and_each_start_is_counted_once(self) -> None:
