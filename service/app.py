@@ -18,7 +18,7 @@ from service.context import Context
 from service.downloads import OpenResults
 from service.lingering import LingeringClose
 from service.metrics import MeasuredRequests, Metrics
-from service.routes import health, info, jobs, metrics, results
+from service.routes import events, health, info, jobs, metrics, results
 from service.routes import problems as problem_pages
 from worker.changes import ChangeFeed
 from worker.connections import connect_async
@@ -100,7 +100,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.router.redirect_slashes = False
     problems.install(app)
-    for routes in (jobs, results, info, health, metrics, problem_pages):
+    for routes in (jobs, events, results, info, health, metrics, problem_pages):
         app.include_router(routes.router)
         app.include_router(_heads_of(routes.router))
     app.add_middleware(NoSniff)

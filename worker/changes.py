@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 import structlog
@@ -28,6 +29,28 @@ _LOOK_ANYWAY_SECONDS = 10.0
 log = structlog.get_logger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class Deletion:
+    """That a job was deleted."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """That changes may have been missed: who keeps a list of jobs has to make it anew."""
+
+
+@dataclass(eq=False, slots=True)
+class _Inbox:
+    """What somebody who watches all jobs has not seen yet."""
+
+    owner: str | None
+    missed: bool = True
+    changed: dict[str, bool] = field(default_factory=dict)  # by id: whether it was deleted
+    filled: asyncio.Event = field(default_factory=asyncio.Event)
+
+
 class ChangeFeed:
     """One subscription of a process to the changes of all jobs, shared by all that wait.
 
@@ -42,6 +65,8 @@ class ChangeFeed:
     def __init__(self, redis: Redis) -> None:
         self.redis = redis
         self._waiting: dict[str, set[asyncio.Event]] = {}
+        self._inboxes: set[_Inbox] = set()
+        self._fetches: dict[str, asyncio.Task[JobRecord | None]] = {}
         self._listener: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -86,22 +111,90 @@ class ChangeFeed:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(announced.wait(), min(remaining, _LOOK_ANYWAY_SECONDS))
 
-    async def watch(self, job_id: str) -> AsyncIterator[JobRecord]:
-        """Yield the record as it is, then at each change, until the job has ended or is deleted."""
-        version = -1
+    async def watch(self, job_id: str, known: int = -1) -> AsyncIterator[JobRecord]:
+        """Yield the record as it is, then at each change, until the job has ended or is deleted.
+
+        While Redis is away nothing comes.
+
+        Parameters
+        ----------
+        job_id : str
+        known : int
+            The version the caller knows; the record is not yielded before it differs or has ended.
+
+        Yields
+        ------
+        JobRecord
+            The last one has ended, unless the job was deleted.
+        """
+        version = known
         with self._announcements(job_id) as announced:
             while True:
                 announced.clear()
-                record = await self.get(job_id)
+                record = await self._shared_get(job_id)
                 if record is None:
                     return
-                if record.version != version:
-                    version = record.version
+                if record.version != version or record.final:
                     yield record
-                    if record.final:
-                        return
+                if record.final:
+                    return
+                version = record.version
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(announced.wait(), _LOOK_ANYWAY_SECONDS)
+
+    async def watch_all(self, owner: str | None) -> AsyncIterator[JobRecord | Deletion | Gap]:
+        """Yield the records of all jobs as they change, for ever.
+
+        Several changes of a job that come while the caller is busy are yielded as one.
+
+        Parameters
+        ----------
+        owner : str or None
+            Only the jobs of this owner; None for all.
+
+        Yields
+        ------
+        JobRecord, Deletion or Gap
+            First of all a gap: what is listed after it and changed by what follows is up to date.
+        """
+        inbox = _Inbox(owner)
+        inbox.filled.set()
+        self._inboxes.add(inbox)
+        try:
+            while True:
+                await inbox.filled.wait()
+                inbox.filled.clear()
+                if inbox.missed:
+                    inbox.missed = False
+                    yield Gap()
+                changed, inbox.changed = inbox.changed, {}
+                for job_id, deleted in changed.items():
+                    if deleted:
+                        yield Deletion(job_id)
+                    elif (record := await self._shared_get(job_id)) is not None:
+                        yield record
+        finally:
+            self._inboxes.discard(inbox)
+
+    async def _shared_get(self, job_id: str) -> JobRecord | None:
+        """Return a record, read once for all who ask for it after the same announcement."""
+        fetch = self._fetches.get(job_id)
+        if fetch is None or fetch.done():
+            fetch = self._fetches[job_id] = asyncio.create_task(self._insist(job_id))
+            fetch.add_done_callback(lambda done: self._forget(job_id, done))
+        return await asyncio.shield(fetch)
+
+    async def _insist(self, job_id: str) -> JobRecord | None:
+        while True:
+            try:
+                return await self.get(job_id)
+            except (RedisError, OSError) as error:
+                log.warning("a job cannot be looked at", job=job_id, reason=str(error))
+                await asyncio.sleep(_RECONNECT_SECONDS)
+
+    def _forget(self, job_id: str, fetch: asyncio.Task[JobRecord | None]) -> None:
+        if self._fetches.get(job_id) is fetch:
+            del self._fetches[job_id]
 
     @contextlib.contextmanager
     def _announcements(self, job_id: str) -> Iterator[asyncio.Event]:
@@ -117,7 +210,6 @@ class ChangeFeed:
 
     async def _listen(self) -> None:
         """Pass announcements on; after a broken connection wake everyone to look again."""
-        start = len(changed_channel(""))
         while True:
             try:
                 async with self.redis.pubsub() as subscription:
@@ -128,14 +220,27 @@ class ChangeFeed:
                             ignore_subscribe_messages=True, timeout=_LOOK_ANYWAY_SECONDS
                         )
                         if message is not None:
-                            job_id = cast("bytes", message["channel"])[start:].decode()
-                            for event in self._waiting.get(job_id, ()):
-                                event.set()
+                            self._announce(message["channel"], message["data"])
             except (RedisError, OSError) as error:
                 log.warning("changes of jobs cannot be heard", reason=str(error))
                 await asyncio.sleep(_RECONNECT_SECONDS)
 
+    def _announce(self, channel: bytes, announcement: bytes) -> None:
+        job_id = channel[len(changed_channel("")) :].decode()
+        version, _, owner = announcement.decode().partition(" ")
+        self._fetches.pop(job_id, None)  # what is being read may be older than this
+        for event in self._waiting.get(job_id, ()):
+            event.set()
+        for inbox in self._inboxes:
+            if inbox.owner is None or inbox.owner == owner:
+                inbox.changed[job_id] = version == "deleted"
+                inbox.filled.set()
+
     def _wake_all(self) -> None:
+        self._fetches.clear()
         for events in self._waiting.values():
             for event in events:
                 event.set()
+        for inbox in self._inboxes:
+            inbox.missed = True
+            inbox.filled.set()

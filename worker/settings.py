@@ -143,6 +143,12 @@ class Settings(BaseSettings):
         default="",
         pattern=r"^(https?://[^\s,/]+(\s*,\s*https?://[^\s,/]+)*)?$",
         description="Origins whose pages may use the API, with commas, as https://a.example.org.",
+
+    event_heartbeat_seconds: float = Field(
+        default=15,
+        gt=0,
+        description="Time between signs of life in a stream of events; less than the idle limit of "
+        "proxies.",
     )
 
     log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR|CRITICAL)$")

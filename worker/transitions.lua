@@ -15,7 +15,8 @@
 --   holds                        sorted set of ids of holds by the time they lapse
 --   counters                     hash: counts of all jobs (`worker.counters`, which also gives the
 --                                `bounds` of histograms and the `sizes` of jobs used here)
---   changed:{id}                 channel: the record's version at every visible change
+--   changed:{id}                 channel: the record's version at every visible change, or
+--                                'deleted'; a space; the owner
 --
 -- `attempt` is a fencing token: it grows with every start of the job, and only the holder of the
 -- current one, while the job is running, may report, publish or fail. Every step may be sent twice
@@ -41,8 +42,9 @@ local function read(key, field)
 end
 
 local function changed(job)
-  local version = redis.call('HINCRBY', prefix .. 'job:' .. job, 'version', 1)
-  redis.call('PUBLISH', prefix .. 'changed:' .. job, version)
+  local key = prefix .. 'job:' .. job
+  local version = redis.call('HINCRBY', key, 'version', 1)
+  redis.call('PUBLISH', prefix .. 'changed:' .. job, version .. ' ' .. (read(key, 'owner') or ''))
 end
 
 local function indices(owner, status)
@@ -490,7 +492,7 @@ function steps.delete(only_expired, again)
   for _, folder in ipairs({ 'uploads/', 'results/' }) do
     redis.call('ZADD', garbage, stamp(now + again), folder .. id .. '/')
   end
-  redis.call('PUBLISH', prefix .. 'changed:' .. id, 'deleted')
+  redis.call('PUBLISH', prefix .. 'changed:' .. id, 'deleted ' .. (owner or ''))
   return { 'ok', ticket }
 end
 
