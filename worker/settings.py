@@ -143,6 +143,7 @@ class Settings(BaseSettings):
         default="",
         pattern=r"^(https?://[^\s,/]+(\s*,\s*https?://[^\s,/]+)*)?$",
         description="Origins whose pages may use the API, with commas, as https://a.example.org.",
+    )
 
     event_heartbeat_seconds: float = Field(
         default=15,
