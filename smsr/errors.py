@@ -170,6 +170,13 @@ class InvalidOption(InputError):
     title = "An option has an invalid value"
 
 
+class AnimationTooLarge(SmsrError):
+    """More frames or points than one GLB file can hold."""
+
+    slug = "animation-too-large"
+    title = "The animation is too large for one file"
+
+
 class Cancelled(SmsrError):
     """The progress callback asked the run to stop."""
 

@@ -2,6 +2,7 @@
 
 from smsr.files.faces import load_faces
 from smsr.files.formats import HEAD_BYTES, FileFormat, sniff
+from smsr.files.glb import Glb, GlbOptions, write_glb
 from smsr.files.npy import npy_header
 from smsr.files.npz import write_npz
 from smsr.files.opening import DEFAULT_LIMIT, open_array
@@ -15,6 +16,8 @@ __all__ = [
     "HEAD_BYTES",
     "Beginning",
     "FileFormat",
+    "Glb",
+    "GlbOptions",
     "Role",
     "check_prefix",
     "load_faces",
@@ -24,6 +27,7 @@ __all__ = [
     "ply_face_block",
     "ply_header",
     "sniff",
+    "write_glb",
     "write_npz",
     "write_ply",
 ]
