@@ -13,15 +13,17 @@ import hashlib
 import json
 import re
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
 from anyio import to_thread
+from starlette.concurrency import iterate_in_threadpool
 from starlette.datastructures import Headers
 from starlette.responses import Response, StreamingResponse
 
+import smsr
 from service.archives import Member, archive_size, stream_archive
 from service.conditional import (
     NotModified,
@@ -31,6 +33,7 @@ from service.conditional import (
     wanted_range,
 )
 from service.problems import Problem
+from smsr.files.glb import Bounds, Glb, GlbOptions
 from smsr.files.npy import HEADER_BYTES, parse_header
 from smsr.files.ply import FACE_BYTES, VERTEX_BYTES, ply_face_block, ply_header
 from worker.storage import ObjectMissing
@@ -38,6 +41,7 @@ from worker.storage import ObjectMissing
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
+    from numpy.typing import NDArray
     from starlette.types import Receive, Scope, Send
 
     from worker.records import JobRecord
@@ -45,6 +49,8 @@ if TYPE_CHECKING:
 
 ARRAYS = ("shapes.npy", "cameras.npy", "translations.npy", "faces.npy")
 """Arrays of a result as the worker stores them; faces only where faces were sent."""
+
+_KEPT_BOUNDS = 4
 
 WINDOW_BYTES = 3 << 20
 """Bytes read at once; a multiple of a row of faces."""
@@ -207,6 +213,8 @@ class ResultFiles:
         None where no faces were sent.
     validators : Validators
         Different for each run of the job; its time is the time stamp of archive members.
+    bounds : dict
+        Ranges of the shapes by how many frames are taken, kept because finding them reads all.
     """
 
     storage: ObjectStorage
@@ -215,6 +223,7 @@ class ResultFiles:
     translations: StoredArray
     faces: StoredArray | None
     validators: Validators
+    bounds: dict[int, Bounds] = field(default_factory=dict)
 
     @classmethod
     async def open(
@@ -324,6 +333,55 @@ class ResultFiles:
         start, end = self.faces.offset, self.faces.size
         async for chunk in read_range(self.storage, self.faces.key, start, end - start):
             yield ply_face_block(np.frombuffer(chunk, self.faces.dtype).reshape(-1, 3))
+
+    # Animation
+
+    async def animation(self, options: GlbOptions, name: str) -> Download:
+        """Answer with the whole sequence as an animated GLB.
+
+        Raises
+        ------
+        smsr.errors.AnimationTooLarge
+            A GLB cannot hold so much.
+        """
+        made = await to_thread.run_sync(self._glb, options)
+        content = Content(
+            made.size, lambda start, stop: iterate_in_threadpool(made.pieces(start, stop))
+        )
+        # Each version of the writer and each choice of options makes other bytes.
+        kind = hashlib.sha256(f"{smsr.__version__} {options}".encode()).hexdigest()[:12]
+        validators = replace(self.validators, tag=f"{self.validators.tag}-{kind}", dated=False)
+        return Download(content, name=name, validators=validators, media_type="model/gltf-binary")
+
+    def _glb(self, options: GlbOptions) -> Glb:
+        """Look at the shapes, once for each way to take frames of them."""
+        shapes, faces = self.shapes, self.faces
+        row = shapes.dtype.itemsize * 3
+
+        def read(start: int, stop: int) -> NDArray[Any]:
+            data = self.storage.get_range(
+                shapes.key, shapes.offset + start * row, (stop - start) * row
+            )
+            return np.frombuffer(data, shapes.dtype).reshape(-1, 3)
+
+        size = self.cameras.dtype.itemsize * 6
+        camera = self.storage.get_range(self.cameras.key, self.cameras.offset, size)
+        triangles = None
+        if faces is not None:
+            data = self.storage.get_range(faces.key, faces.offset, faces.size - faces.offset)
+            triangles = np.frombuffer(data, faces.dtype).reshape(-1, 3)
+        made = Glb(
+            read,
+            frames=self.frames,
+            points=self.points,
+            camera=np.frombuffer(camera, self.cameras.dtype).reshape(2, 3),
+            faces=triangles,
+            options=options,
+            bounds=self.bounds.get(options.every),
+        )
+        if len(self.bounds) < _KEPT_BOUNDS:
+            self.bounds[options.every] = made.bounds
+        return made
 
     # Archives
 

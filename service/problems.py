@@ -345,6 +345,8 @@ _REMEDIES = {
     "invalid-faces": "Give triangles as rows of three point numbers, counted from 0.",
     "unknown-option": "GET /v1/info lists all options.",
     "invalid-option": "GET /v1/info lists type, range and choices of every option.",
+    "animation-too-large": "Ask for fewer frames by the parameter `every`; the problem's member "
+    "`every` has a value that fits. The NPZ and the PLY files have no such limit.",
     "cancelled": "Submit again if the result is wanted after all.",
     "numerical-failure": "Tell the operator the id of the job.",
     "time-limit": "Raise the option `time_limit`, or send fewer points or frames.",
@@ -378,7 +380,7 @@ _OF_JOBS = (*_of_exceptions(errors), *_of_exceptions(worker_problems))
 
 CATALOGUE: dict[str, ProblemType] = {kind.slug: kind for kind in (*_OF_JOBS, *_OF_THE_SERVICE)}
 
-JOB_PROBLEMS = frozenset(kind.slug for kind in _OF_JOBS)
+JOB_PROBLEMS = frozenset(kind.slug for kind in _OF_JOBS) - {errors.AnimationTooLarge.slug}
 """Problems that may end a job."""
 
 

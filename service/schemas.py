@@ -93,6 +93,7 @@ class JobLinks(BaseModel):
     cameras: str | None = Field(description="cameras.npy, float64 (T, 2, 3)")
     translations: str | None = Field(description="translations.npy, float64 (T, 2)")
     faces: str | None = Field(description="faces.npy, (F, 3), where faces were sent")
+    glb: str | None = Field(description="result.glb, the animated surface (glTF 2.0)")
     report: str | None = Field(description="report.json")
 
 
@@ -153,6 +154,7 @@ class Job(BaseModel):
                         "cameras": f"{_SELF}/cameras.npy",
                         "translations": f"{_SELF}/translations.npy",
                         "faces": None,
+                        "glb": f"{_SELF}/result.glb",
                         "report": f"{_SELF}/report.json",
                     },
                 }
@@ -333,6 +335,7 @@ def job_document(
             cameras=f"{here}/cameras.npy" if done else None,
             translations=f"{here}/translations.npy" if done else None,
             faces=f"{here}/faces.npy" if done and "faces" in record.inputs else None,
+            glb=f"{here}/result.glb" if done else None,
             report=f"{here}/report.json" if done else None,
         ),
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import smsr
-from service.cli import benchmark, demo, local, remote, serve
+from service.cli import benchmark, demo, local, remote, results, serve
 from service.cli.exits import EXPECTED, HELP, console, leave
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ app = typer.Typer(
 
 app.command()(local.reconstruct)
 app.command()(local.evaluate)
+app.command()(results.convert)
 app.command()(local.options)
 app.command()(local.example)
 app.command()(remote.submit)

@@ -19,7 +19,7 @@ from service.cli import option_values
 from service.cli.bars import SolverBar, progress_bars
 from service.cli.exits import console, errors
 from smsr.errors import InputError
-from smsr.files import load_faces, open_array, open_result, write_npz, write_ply
+from smsr.files import load_faces, open_array, open_result, write_glb, write_npz, write_ply
 from smsr.measurements import as_source
 from smsr.metrics import Frame, as_shapes
 from smsr.options import OptionDescription, Options, describe, parse
@@ -97,6 +97,9 @@ def reconstruct(
     frame: FrameOfTruth = "auto",
     option: OptionValues = None,
     ply: Annotated[bool, typer.Option(help="Write a PLY of every frame.")] = True,
+    glb: Annotated[
+        bool, typer.Option("--glb", help="Write an animated GLB; smsr convert has its options.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Reconstruct the surface from 2D tracks, on this machine.
@@ -140,6 +143,8 @@ def reconstruct(
         report = result.diagnostics.to_dict()
         report["metrics"] = None if error is None else error.to_dict()
         _write(target, result, triangles, report, ply=ply)
+        if glb:
+            write_glb(target / "result.glb", result.shapes, result.cameras, triangles)
     if as_json:
         console.print_json(data=report)
     else:

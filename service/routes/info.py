@@ -29,7 +29,10 @@ async def get_info(shared: Shared) -> Info:
             page_size=PAGE_SIZE,
         ),
         formats=Formats(
-            measurements=arrays, ground_truth=arrays, faces=arrays, results=["npz", "ply", "json"]
+            measurements=arrays,
+            ground_truth=arrays,
+            faces=arrays,
+            results=["npz", "ply", "glb", "json"],
         ),
         options=[option_document(option) for option in describe(JobOptions)],
     )

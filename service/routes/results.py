@@ -4,7 +4,7 @@ from enum import StrEnum
 from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Path
+from fastapi import APIRouter, Path, Query
 from starlette.responses import StreamingResponse
 
 from service.conditional import Validators
@@ -17,6 +17,7 @@ from service.downloads import (
     stored_content,
 )
 from service.problems import Problem, example_responses
+from smsr.files.glb import GlbOptions, ImageV
 from worker.records import JobRecord
 from worker.storage import ObjectMissing
 
@@ -121,6 +122,42 @@ async def get_frame(
             frames=files.frames,
         )
     return files.frame(frame, f"smsr-{job_id}-frame-{frame:04d}.ply")
+
+
+@router.get(
+    "/result.glb",
+    summary="The sequence as one animated GLB",
+    response_class=StreamingResponse,
+    responses={
+        200: _binary("model/gltf-binary", "glTF 2.0 with morph targets, for viewers and Blender."),
+        **_PROBLEMS,
+        **example_responses("invalid-request", "animation-too-large"),
+    },
+)
+async def get_glb(
+    shared: Shared,
+    job_id: JobId,
+    quantised: Annotated[
+        bool,
+        Query(description="Integers of 16 and 8 bits (KHR_mesh_quantization): a smaller file."),
+    ] = False,
+    fps: Annotated[
+        float, Query(gt=0, le=1000, description="Frames of the sequence per second.")
+    ] = GlbOptions().fps,
+    every: Annotated[int, Query(ge=1, le=1_000_000, description="Take every n-th frame.")] = 1,
+    image_v: Annotated[
+        ImageV,
+        Query(description="Where the second image coordinate grows to: `down` for pixels."),
+    ] = "up",
+) -> Download:
+    """Return the surface, as a mesh where faces were sent and as points otherwise, and its motion.
+
+    It stands upright and as the first camera saw it, y up, and has about the size 2; the node's
+    scale leads back to the unit of the measurements.
+    """
+    files = await _open(shared, job_id)
+    options = GlbOptions(fps, quantised, every, image_v)
+    return await files.animation(options, f"smsr-{job_id}.glb")
 
 
 @router.get(

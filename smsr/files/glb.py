@@ -237,12 +237,14 @@ class Glb:
         """Read points of frames that follow each other, (len(frames), stop - start, 3)."""
         first = frames[0] * self._points + start
         last = frames[-1] * self._points + stop
-        rows = np.asarray(self._read(first, last), np.float32)
-        return rows.reshape(len(frames), stop - start, 3)
+        rows = self._read(first, last).reshape(len(frames), stop - start, 3)
+        found: NDArray[np.float32] = rows.astype(np.float32, copy=False)
+        return found
 
     def _first(self, start: int, stop: int) -> NDArray[np.float32]:
         if self._points > _WINDOW and self._normals is None:
-            return self._rows(range(1), start, stop)[0]
+            first: NDArray[np.float32] = self._rows(range(1), start, stop)[0]
+            return first
         if self._kept is None:
             self._kept = self._rows(range(1), 0, self._points)[0]
         return self._kept[start:stop]
@@ -510,7 +512,8 @@ class _Normals:
         flat = lengths <= 1e-30
         normals[flat] = (0.0, 0.0, 1.0)
         lengths[flat] = 1.0
-        return normals / lengths[:, None]
+        found: Array = normals / lengths[:, None]
+        return found
 
 
 class _Views:

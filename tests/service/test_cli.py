@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from service.cli import main
+from smsr.files import GlbOptions, open_result, write_glb
 from smsr.synthetic import write_example
 from tests.conftest import clean_environment, serving
 
@@ -87,6 +88,27 @@ def test_the_frames_are_meshes_others_can_read(result: Path) -> None:
     with np.load(result / "result.npz") as arrays:
         assert np.allclose(mesh.vertices, arrays["shapes"][7])
         assert np.array_equal(mesh.faces, arrays["faces"])
+
+
+def test_a_result_becomes_an_animation(result: Path, example: Path, tmp_path: Path) -> None:
+    found = open_result(result / "result.npz")
+    faces = np.load(example / "faces.npy")
+    write_glb(tmp_path / "expected.glb", found.shapes, found.cameras, faces)
+    succeeded(smsr("convert", result, "-o", tmp_path / "a.glb"))
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "expected.glb").read_bytes()
+    more = ["--quantised", "--every", "2", "--image-v", "down", "--fps", "10"]
+    shown = succeeded(smsr("convert", result / "result.npz", "-o", tmp_path / "b.glb", *more))
+    assert str(tmp_path / "b.glb") in shown
+    options = GlbOptions(10.0, quantised=True, every=2, image_v="down")
+    write_glb(tmp_path / "expected.glb", found.shapes, found.cameras, faces, options)
+    assert (tmp_path / "b.glb").read_bytes() == (tmp_path / "expected.glb").read_bytes()
+
+
+def test_reconstruct_writes_an_animation_where_asked(example: Path, tmp_path: Path) -> None:
+    tracks = example / "measurements.npy"
+    succeeded(smsr("reconstruct", tracks, "-o", tmp_path / "r", "--no-ply", "--glb"))
+    succeeded(smsr("convert", tmp_path / "r", "-o", tmp_path / "a.glb"))
+    assert (tmp_path / "r" / "result.glb").read_bytes() == (tmp_path / "a.glb").read_bytes()
 
 
 def test_evaluate_agrees_with_the_report(result: Path, example: Path) -> None:

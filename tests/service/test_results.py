@@ -11,6 +11,8 @@ import pytest
 import trimesh
 
 import smsr
+from smsr.files import GlbOptions, write_glb
+from smsr.synthetic import make_low_rank
 from tests.service.conftest import Api, finished, npy, problem, submit
 
 if TYPE_CHECKING:
@@ -132,12 +134,61 @@ def test_a_result_is_sent_again_only_when_it_is_another(
 
 def test_head_tells_what_get_would(client: httpx.Client, job: dict[str, Any]) -> None:
     frame = job["links"]["frame"].replace("{t}", "0")
-    links = [job["links"][name] for name in ("self", "result", "frames", "report")]
+    links = [job["links"][name] for name in ("self", "result", "frames", "report", "glb")]
     for url in (*links, frame, "/v1/jobs", "/v1/info", "/healthz", "/problems"):
         got, asked = client.get(url), client.head(url)
         assert (asked.status_code, asked.content) == (200, b"")
         for name in ("content-type", "content-length", "content-disposition", "etag"):
             assert asked.headers.get(name) == got.headers.get(name), (url, name)
+
+
+def test_the_animation_is_that_of_the_result(
+    client: httpx.Client,
+    job: dict[str, Any],
+    bare_job: dict[str, Any],
+    example: Example,
+    expected: Reconstruction,
+    tmp_path: Path,
+) -> None:
+    for document, faces in ((job, example.faces), (bare_job, None)):
+        for query, options in (
+            ({}, GlbOptions()),
+            (
+                {"quantised": "true", "fps": "12.5", "every": "3", "image_v": "down"},
+                GlbOptions(12.5, quantised=True, every=3, image_v="down"),
+            ),
+        ):
+            answer = client.get(document["links"]["glb"], params=query)
+            assert answer.headers["content-type"] == "model/gltf-binary"
+            assert int(answer.headers["content-length"]) == len(answer.content)
+            write_glb(tmp_path / "a.glb", expected.shapes, expected.cameras, faces, options)
+            assert answer.content == (tmp_path / "a.glb").read_bytes()
+            part = client.get(
+                document["links"]["glb"],
+                params=query,
+                headers={"Range": "bytes=1000-4999", "If-Range": answer.headers["etag"]},
+            )
+            assert (part.status_code, part.content) == (206, answer.content[1000:5000])
+    url = bare_job["links"]["glb"]
+    plain = client.get(url).headers["etag"]
+    assert client.get(url, headers={"If-None-Match": plain}).status_code == 304
+    assert client.get(url, params={"fps": 5}, headers={"If-None-Match": plain}).status_code == 200
+
+
+@pytest.mark.parametrize("query", ["fps=0", "fps=nan", "every=0", "image_v=left", "quantised=x"])
+def test_animations_that_make_no_sense_are_refused(
+    client: httpx.Client, bare_job: dict[str, Any], query: str
+) -> None:
+    problem(client.get(f"{bare_job['links']['glb']}?{query}"), "invalid-request", 422)
+
+
+def test_more_frames_than_a_file_can_animate(client: httpx.Client) -> None:
+    tracks = make_low_rank(2060, 6).measurements.astype(np.float32)
+    job = finished(client, submit(client, {"measurements": ("w.npy", npy(tracks))}))
+    assert job["status"] == "succeeded", job
+    answer = client.get(job["links"]["glb"])
+    assert problem(answer, "animation-too-large", 422)["every"] == 2
+    assert client.get(job["links"]["glb"], params={"every": 2}).status_code == 200
 
 
 def test_frames_out_of_range(client: httpx.Client, job: dict[str, Any]) -> None:

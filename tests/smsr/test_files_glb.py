@@ -124,12 +124,13 @@ def test_normals_are_those_of_the_mesh_in_every_frame(tmp_path: Path) -> None:
 @with_node
 def test_odd_inputs_are_valid_too(tmp_path: Path) -> None:
     """One frame, no motion, points of no face, faces of no area, other types and orders."""
-    cases = {
+    thin = np.array([[0, 1, 2], [0, 0, 1]])
+    cases: dict[str, tuple[NDArray[Any], NDArray[Any] | None, GlbOptions]] = {
         "one": (SHAPES, None, GlbOptions(every=100)),
         "still": (np.repeat(SHAPES[:1], 3, axis=0), EXAMPLE.faces, GlbOptions(quantised=True)),
         "nothing": (np.zeros((3, 5, 3), np.float32), None, GlbOptions()),
         "loose": (SHAPES.astype(np.float64), EXAMPLE.faces[:4], GlbOptions(fps=29.97)),
-        "thin": (SHAPES, [[0, 1, 2], [0, 0, 1]], GlbOptions(every=3)),
+        "thin": (SHAPES, thin, GlbOptions(every=3)),
         "fortran": (np.asfortranarray(SHAPES), EXAMPLE.faces[:0], GlbOptions(every=5)),
     }
     for name, (shapes, faces, options) in cases.items():
