@@ -121,8 +121,11 @@ class JobMetrics(Collector):
             yield from _durations(survey.counters)
 
     def _now(self, survey: Survey) -> Iterator[Metric]:
-        depth = GaugeMetricFamily("smsr_queue_depth", "Jobs that wait.", labels=["queue"])
-        depth.add_metric([self._queue], survey.jobs["queued"])
+        depth = GaugeMetricFamily(
+            "smsr_queue_depth", "Jobs that wait.", labels=["queue", "priority"]
+        )
+        for priority, count in survey.queued.items():
+            depth.add_metric([self._queue, priority], count)
         yield depth
         jobs = GaugeMetricFamily("smsr_jobs", "Records of jobs.", labels=["status"])
         for status, count in survey.jobs.items():
@@ -139,6 +142,8 @@ def _ends(counters: Counters) -> Iterator[Metric]:
     for status in FINAL:
         finished.add_metric([status], counters.ended.get(status, 0))
     yield finished
+    reused = "Jobs that were not run, but took the result of an equal one."
+    yield CounterMetricFamily("smsr_jobs_reused", reused, counters.reused)
     failures = CounterMetricFamily(
         "smsr_failures", "Failures of jobs by problem type.", labels=["type"]
     )

@@ -107,6 +107,10 @@ class Job(BaseModel):
                     "id": _ID,
                     "status": "succeeded",
                     "name": "tracks.npy",
+                    "batch": "walk-17",
+                    "priority": "normal",
+                    "ttl": None,
+                    "reused_from": None,
                     "created_at": "2026-03-01T12:00:00.120000Z",
                     "started_at": "2026-03-01T12:00:00.180000Z",
                     "finished_at": "2026-03-01T12:00:03.910000Z",
@@ -165,10 +169,23 @@ class Job(BaseModel):
     id: str
     status: JobStatus
     name: str | None = Field(description="Name of the measurement file.")
+    batch: str | None = Field(description="Label of the batch that the job belongs to.")
+    priority: Literal["high", "normal", "low"]
+    ttl: float | None = Field(
+        description="Seconds that the job asked to be kept after its end, 0 for ever; null where "
+        "it left that to the service."
+    )
+    reused_from: str | None = Field(
+        description="Id of the equal job that made the result, where this one was not run; that "
+        "job may be gone."
+    )
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
-    expires_at: datetime | None = Field(description="When a finished job and its files go.")
+    expires_at: datetime | None = Field(
+        description="When a finished job and its files go; null while it has not ended, and where "
+        "it is kept for ever."
+    )
     attempt: int = Field(description="How often a worker has started it.")
     queue_position: int | None = Field(
         description="Number of jobs before a queued one, in the document of one job."
@@ -297,6 +314,10 @@ def job_document(
         id=record.id,
         status=record.status,
         name=record.name,
+        batch=record.batch,
+        priority=record.priority,
+        ttl=record.ttl,
+        reused_from=record.reused_from,
         created_at=_moment(record.created_at),
         started_at=_moment_or_none(record.started_at),
         finished_at=_moment_or_none(record.finished_at),

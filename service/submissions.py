@@ -9,17 +9,22 @@ other.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import logging
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from anyio import to_thread
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
 from redis.exceptions import RedisError
 
+import smsr
 from service.problems import Problem
-from worker.records import JobRecord, upload_prefix
+from worker.records import JobRecord, Priority, upload_prefix
 from worker.settings import Settings
 from worker.storage import StorageError
 
@@ -36,7 +41,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-Priority = Literal["high", "normal", "low"]
+_NOT_IN_RESULTS = ("time_limit",)
+"""Options that do not change what a job that succeeds gives."""
 
 LABEL_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 """Of a batch; a label is a part of paths and of file names as it is."""
@@ -70,10 +76,11 @@ class JobSettings(BaseModel):
         "the service allows that. Without it the service's own time holds.",
         examples=[86400],
     )
-    reuse: bool = Field(
-        default=True,
+    reuse: bool | None = Field(
+        default=None,
         description="Whether the finished result of an equal job, one with the same files and "
-        "options, may be taken. `false` makes a new run.",
+        "options, may be taken: the job has succeeded at once then. `false` makes a new run. "
+        "Without it the service decides, which says yes unless its operator has chosen otherwise.",
     )
 
     @field_validator("ttl")
@@ -160,22 +167,55 @@ class Submission:
     settings: JobSettings = field(default_factory=JobSettings)
 
 
+def digest_of(submission: Submission, owner: str | None) -> str:
+    """Return what is equal for an owner's submissions with equal results.
+
+    It covers the bytes of all files, what their names say of their formats, the options that have a
+    part in the result, and the version of the solver.
+    """
+    options = dataclasses.asdict(submission.options)
+    for name in _NOT_IN_RESULTS:
+        del options[name]
+    return _hash(
+        {
+            "owner": owner,
+            "solver": smsr.__version__,
+            "options": options,
+            "inputs": {
+                role: [file.sha256, Path(file.name.lower()).suffixes]
+                for role, file in submission.inputs.items()
+            },
+        }
+    )
+
+
+def _hash(document: object) -> str:
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 async def accept(shared: Context, job_id: str, submission: Submission) -> JobRecord:
     """Make a submission a job of this request's owner; Redis may go away at any moment.
 
     Where there is no job in the end, the files are removed.
     """
+    settings = submission.settings
     record = JobRecord.new(
         job_id,
         options=dataclasses.asdict(submission.options),
         inputs={str(role): file for role, file in submission.inputs.items()},
         name=submission.inputs["measurements"].name,
         owner=shared.owner,
+        batch=settings.batch,
+        priority=settings.priority,
+        ttl=settings.ttl,
+        digest=digest_of(submission, shared.owner),
         frames=submission.frames,
         points=submission.points,
     )
+    reuse = shared.settings.reuse_results if settings.reuse is None else settings.reuse
     try:
-        return await to_thread.run_sync(shared.queue.submit, record)
+        return await to_thread.run_sync(partial(shared.queue.submit, record, reuse=reuse))
     except RedisError:
         # A record without a place in the queue gets one by maintenance: it is accepted. Where not
         # even that can be seen now, the files stay until maintenance knows whether there is one.

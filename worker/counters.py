@@ -75,6 +75,8 @@ class Counters:
         Failed ones by the last part of the problem type.
     lost : int
         Attempts that ended with their worker.
+    reused : int
+        Jobs that took the result of another one; they were not run, and are not in `ended`.
     waits : Histogram
         From being queued to each start.
     runs : dict of str to Histogram
@@ -86,6 +88,7 @@ class Counters:
     ended: dict[str, int] = field(default_factory=dict)
     failures: dict[str, int] = field(default_factory=dict)
     lost: int = 0
+    reused: int = 0
     waits: Histogram = field(default_factory=Histogram)
     runs: dict[str, Histogram] = field(default_factory=dict)
     stages: dict[str, Histogram] = field(default_factory=dict)
@@ -102,6 +105,8 @@ def decode(found: Mapping[bytes, bytes]) -> Counters:
                 counters.failures[slug] = int(value)
             case ["lost"]:
                 counters.lost = int(value)
+            case ["reused"]:
+                counters.reused = int(value)
             case ["wait", part]:
                 counters.waits._add(part, value)
             case ["run", size, part]:

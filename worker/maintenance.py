@@ -94,6 +94,6 @@ class Maintenance:
                 or prefix == record.result_prefix
                 or (record.status == "running" and attempt == str(record.attempt))
             )
-            if not needed:
+            if not needed and not self.queue.records.held(prefix):
                 orphans.append(prefix)
         return orphans

@@ -22,21 +22,21 @@ from worker.problems import WorkerLost, problem_document
 from worker.records import (
     ANY,
     PREFIX,
+    PRIORITIES,
     Allowance,
     JobActive,
     JobRecord,
     RecordStore,
     TooManyJobs,
-    results_prefix,
-    upload_prefix,
 )
 from worker.storage import ObjectMissing, ObjectStorage, StorageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from redis import Redis
 
+    from worker.records import IdempotencyKey, Priority
     from worker.settings import Settings
 
 TASK = "worker.task.run"
@@ -52,6 +52,17 @@ _LATE_WRITER_SECONDS = 15.0
 """After a deletion a worker that has not noticed may write for a while; look again after that."""
 
 log = structlog.get_logger(__name__)
+
+
+def queue_names(name: str) -> dict[Priority, str]:
+    """Return the names of the RQ queues, in the order in which workers serve them.
+
+    The normal one has no suffix: it is the queue that there was before there were priorities, so
+    that jobs which an earlier version queued are run, and its workers run normal jobs.
+    """
+    return {
+        priority: name if priority == "normal" else f"{name}-{priority}" for priority in PRIORITIES
+    }
 
 
 class InputsGone(Exception):
@@ -102,7 +113,10 @@ class JobQueue:
         self.settings = settings
         self.redis = redis
         self.records = RecordStore(redis, result_ttl=settings.result_ttl_seconds)
-        self.rq = Queue(settings.queue, connection=redis, serializer=JSONSerializer)
+        self.queues: Mapping[Priority, Queue] = {
+            priority: Queue(name, connection=redis, serializer=JSONSerializer)
+            for priority, name in queue_names(settings.queue).items()
+        }
         self._storage = storage
 
     @property
@@ -115,7 +129,13 @@ class JobQueue:
     # For the service
 
     def submit(
-        self, record: JobRecord, allowance: Allowance = ANY, uploads: Sequence[str] = ()
+        self,
+        record: JobRecord,
+        allowance: Allowance = ANY,
+        uploads: Sequence[str] = (),
+        *,
+        reuse: bool = False,
+        key: IdempotencyKey | None = None,
     ) -> JobRecord:
         """Accept a job whose inputs are stored, and return its record as it is now.
 
@@ -126,6 +146,10 @@ class JobQueue:
             What its owner may have.
         uploads : sequence of str
             Ids of the finished uploads that its inputs were, if they were such.
+        reuse : bool
+            Take the result of a job with the same digest, where there is one.
+        key : IdempotencyKey, optional
+            Bound to the job.
 
         Raises
         ------
@@ -133,8 +157,10 @@ class JobQueue:
             There is a job of this id.
         TooManyJobs, TooManyBytes
             The owner may not have another one.
+        KeyTaken
+            The key is bound or claimed by another submission.
         """
-        self.records.create(record, allowance, uploads)
+        self.records.create(record, allowance, uploads, reuse=reuse, key=key)
         self.enqueue(record.id)
         return self.records.get(record.id) or record
 
@@ -160,13 +186,13 @@ class JobQueue:
         only_expired : bool
             Keep it unless its time to live has passed.
         """
-        outcome, ticket = self.records.delete(
+        outcome, ticket, unwanted = self.records.delete(
             job_id, only_expired=only_expired, again=_LATE_WRITER_SECONDS
         )
         if outcome != "ok":
             return False
         self.discard_ticket(ticket)
-        for prefix in (upload_prefix(job_id), results_prefix(job_id)):
+        for prefix in unwanted:
             try:
                 self.storage.delete_prefix(prefix)
             except StorageError as error:
@@ -207,7 +233,19 @@ class JobQueue:
     def position(self, job_id: str) -> int | None:
         """Return how many jobs are ahead of a queued one, None when it is not queued."""
         ticket = self.records.ticket(job_id)
-        return cast("int | None", self.redis.lpos(self.rq.key, ticket)) if ticket else None
+        if not ticket:
+            return None
+        with self.redis.pipeline() as pipe:
+            for queue in self.queues.values():
+                pipe.lpos(queue.key, ticket)
+                pipe.llen(queue.key)
+            answers = pipe.execute()
+        before = 0
+        for place, length in zip(answers[::2], answers[1::2], strict=True):
+            if place is not None:
+                return before + cast("int", place)
+            before += length
+        return None
 
     def length(self) -> int:
         """Return the number of jobs that wait for a worker."""
@@ -222,10 +260,11 @@ class JobQueue:
     def enqueue(self, job_id: str, *, first: bool = False) -> None:
         """Give a queued job a ticket; nothing happens when it is not queued."""
         ticket = f"{job_id}-{uuid.uuid4().hex[:12]}"
-        former = self.records.assign_ticket(job_id, ticket)
-        if former is None:
+        assigned = self.records.assign_ticket(job_id, ticket)
+        if assigned is None:
             return
-        self.rq.enqueue_call(
+        former, priority = assigned
+        self.queues[priority].enqueue_call(
             TASK,
             args=(job_id,),
             timeout=-1,  # the worker enforces the job's own limit
@@ -243,8 +282,11 @@ class JobQueue:
         """Remove all that RQ knows of a ticket."""
         if not ticket:
             return
-        self.redis.lrem(self.rq.key, 0, ticket)
-        self.redis.lrem(self.rq.intermediate_queue_key, 0, ticket)
+        with self.redis.pipeline() as pipe:
+            for queue in self.queues.values():
+                pipe.lrem(queue.key, 0, ticket)
+                pipe.lrem(queue.intermediate_queue_key, 0, ticket)
+            pipe.execute()
         try:
             Job.fetch(ticket, connection=self.redis, serializer=JSONSerializer).delete()
         except (NoSuchJobError, InvalidJobOperation, ValueError):
@@ -276,7 +318,8 @@ class JobQueue:
         if self.redis.set(
             f"{PREFIX}:looking", 1, nx=True, px=int(settings.lost_ticket_seconds * 250)
         ):
-            unticketed = self.records.without_ticket(settings.lost_ticket_seconds, [self.rq.key])
+            lists = [queue.key for queue in self.queues.values()]
+            unticketed = self.records.without_ticket(settings.lost_ticket_seconds, lists)
             for job_id in unticketed:
                 log.warning("ticket lost, job queued again", job=job_id)
                 self.enqueue(job_id, first=True)

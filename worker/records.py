@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 PREFIX = "smsr"
 """First part of every key."""
 
+Priority: TypeAlias = Literal["high", "normal", "low"]
+PRIORITIES: tuple[Priority, ...] = get_args(Priority)
+"""In the order in which workers serve them."""
+
 Status: TypeAlias = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 FINAL: tuple[Status, ...] = ("succeeded", "failed", "cancelled")
@@ -43,6 +47,10 @@ _WORKERS = f"{PREFIX}:workers"
 
 class JobExists(Exception):
     """There is a job of this id already."""
+
+
+class KeyTaken(Exception):
+    """The key of idempotency belongs to another submission."""
 
 
 class JobActive(Exception):
@@ -118,6 +126,15 @@ class JobRecord:
         By role: 'measurements', 'ground_truth', 'faces'.
     name, owner : str or None
         A name for people; whose job it is (listings can be restricted to an owner).
+    batch : str or None
+        Label of the batch that it belongs to.
+    priority : {'high', 'normal', 'low'}
+    ttl : float or None
+        Seconds to keep it once it has ended, 0 for ever; None for the time that holds for all.
+    digest : str or None
+        Equal for jobs that have equal results; None for a job that shares none.
+    reused_from : str or None
+        Id of the job that made the result, where this one took it over.
     frames, points : int or None
         T and N, as soon as they are known.
     attempt : int
@@ -147,6 +164,11 @@ class JobRecord:
     inputs: Mapping[str, InputFile]
     name: str | None = None
     owner: str | None = None
+    batch: str | None = None
+    priority: Priority = "normal"
+    ttl: float | None = None
+    digest: str | None = None
+    reused_from: str | None = None
     frames: int | None = None
     points: int | None = None
     attempt: int = 0
@@ -172,6 +194,10 @@ class JobRecord:
         inputs: Mapping[str, InputFile],
         name: str | None = None,
         owner: str | None = None,
+        batch: str | None = None,
+        priority: Priority = "normal",
+        ttl: float | None = None,
+        digest: str | None = None,
         frames: int | None = None,
         points: int | None = None,
     ) -> JobRecord:
@@ -184,6 +210,10 @@ class JobRecord:
             inputs=inputs,
             name=name,
             owner=owner,
+            batch=batch,
+            priority=priority,
+            ttl=ttl,
+            digest=digest,
             frames=frames,
             points=points,
         )
@@ -203,6 +233,45 @@ class Page:
 
 
 @dataclass(frozen=True, slots=True)
+class IdempotencyKey:
+    """A key under which a submission makes one job, however often it is sent.
+
+    Attributes
+    ----------
+    name : str
+        Of the key in Redis; it contains whose key it is.
+    fingerprint : str
+        Tells submissions apart.
+    seconds : float
+        How long the key is kept.
+    """
+
+    name: str
+    fingerprint: str
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """How a claim to a key of idempotency went.
+
+    Attributes
+    ----------
+    state : {'ok', 'busy', 'bound'}
+        'busy': another submission holds the claim; 'bound': it has become a job.
+    seconds : float
+        Of a busy one: after which it lapses, unless it is renewed.
+    job, fingerprint : str
+        Of a bound one; the job may have been deleted.
+    """
+
+    state: Literal["ok", "busy", "bound"]
+    seconds: float = 0.0
+    job: str = ""
+    fingerprint: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Survey:
     """The whole queue at one moment.
 
@@ -210,12 +279,15 @@ class Survey:
     ----------
     jobs : dict of str to int
         Records by status.
+    queued : dict of str to int
+        Queued ones by priority.
     workers : int
         Worker processes that live.
     counters : Counters
     """
 
     jobs: Mapping[Status, int]
+    queued: Mapping[Priority, int]
     workers: int
     counters: counters.Counters
 
@@ -311,6 +383,7 @@ class RecordStore:
         limit: int = 50,
         *,
         owner: str | None = None,
+        batch: str | None = None,
     ) -> Page:
         """Return records, newest first.
 
@@ -324,26 +397,37 @@ class RecordStore:
         """
         if status is not None and status not in STATUSES:
             raise ValueError(f"there is no status {status!r}; there are {', '.join(STATUSES)}")
-        index = _index(status, owner)
-        limit = max(1, min(limit, _PAGE_LIMIT))
-        ids, more = self._ids_after(index, _parse_cursor(cursor), limit)
+        index = index_key(status, owner, batch)
+        ids, following = self.page(index, cursor, limit)
         with self.redis.pipeline(transaction=False) as pipe:
-            for job_id, _ in ids:
+            for job_id in ids:
                 pipe.hgetall(record_key(job_id))
             hashes = pipe.execute()
-        records = [decode(job_id, found) for (job_id, _), found in zip(ids, hashes, strict=True)]
-        last = f"{ids[-1][1]:.6f}:{ids[-1][0]}" if more and ids else None
-        return Page(tuple(r for r in records if r is not None), last)
+        records = [decode(job_id, found) for job_id, found in zip(ids, hashes, strict=True)]
+        return Page(tuple(r for r in records if r is not None), following)
 
-    def _ids_after(
+    def page(self, key: str, cursor: str | None, limit: int) -> tuple[Sequence[str], str | None]:
+        """Return some members of a sorted set of times, latest first, and the next cursor.
+
+        Raises
+        ------
+        ValueError
+            The cursor is none that a page gave.
+        """
+        limit = max(1, min(limit, _PAGE_LIMIT))
+        members, more = self._after(key, _parse_cursor(cursor), limit)
+        following = f"{members[-1][1]:.6f}:{members[-1][0]}" if more and members else None
+        return [member for member, _ in members], following
+
+    def _after(
         self, index: str, after: tuple[float, str] | None, limit: int
     ) -> tuple[Sequence[tuple[str, float]], bool]:
-        """Return up to `limit` (id, time) pairs, newest first, and whether there are more."""
+        """Return up to `limit` pairs of member and time, and whether there are more."""
         start = "+inf" if after is None else f"{after[0]:.6f}"
         found: Sequence[tuple[str, float]] = ()
         offset = 0
         while len(found) <= limit:
-            # Redis has ids of one time in reverse order, so those up to the cursor's are skipped.
+            # Redis has members of one time in reverse order: those up to the cursor's are skipped.
             chunk = cast(
                 "list[tuple[bytes, float]]",
                 self.redis.zrevrangebyscore(
@@ -361,7 +445,7 @@ class RecordStore:
         """Return the number of jobs of each status."""
         with self.redis.pipeline() as pipe:
             for status in STATUSES:
-                pipe.zcard(_index(status, owner))
+                pipe.zcard(index_key(status, owner))
             return dict(zip(STATUSES, pipe.execute(), strict=True))
 
     def survey(self, seconds: float) -> Survey:
@@ -377,11 +461,14 @@ class RecordStore:
             pipe.zrange(_WORKERS, 0, -1, withscores=True)
             pipe.hgetall(f"{PREFIX}:counters")
             for status in STATUSES:
-                pipe.zcard(_index(status, None))
-            (now, microseconds), workers, counted, *jobs = pipe.execute()
+                pipe.zcard(index_key(status))
+            for priority in PRIORITIES:
+                pipe.zcard(f"{index_key('queued')}:{priority}")
+            (now, microseconds), workers, counted, *counts = pipe.execute()
         since = now + microseconds / 1e6 - seconds
         return Survey(
-            dict(zip(STATUSES, jobs, strict=True)),
+            dict(zip(STATUSES, counts, strict=False)),
+            dict(zip(PRIORITIES, counts[len(STATUSES) :], strict=True)),
             sum(seen >= since for _, seen in workers),
             counters.decode(counted),
         )
@@ -400,6 +487,10 @@ class RecordStore:
         """Return storage prefixes that are to be removed now."""
         due = self.redis.zrangebyscore(f"{PREFIX}:garbage", "-inf", self._now(), start=0, num=limit)
         return [prefix.decode() for prefix in cast("list[bytes]", due)]
+
+    def held(self, prefix: str) -> bool:
+        """Whether jobs hold the result under this storage prefix that another job made."""
+        return bool(self.redis.exists(f"{PREFIX}:holders:{prefix}"))
 
     def forget_garbage(self, prefix: str) -> None:
         """Note that nothing is left under a storage prefix."""
@@ -474,10 +565,42 @@ class RecordStore:
 
     # The client's steps
 
+    def claim(self, name: str, job_id: str, lease: float) -> Claim:
+        """Claim a key of idempotency for a submission on its way, or learn who has it.
+
+        Doing it again renews the claim.
+
+        Parameters
+        ----------
+        name : str
+            See `IdempotencyKey`.
+        job_id : str
+            Id that the job of this submission will have.
+        lease : float
+            Seconds after which the claim lapses.
+        """
+        state, *rest = self._step("claim", job_id, name, lease)
+        match state:
+            case b"busy":
+                return Claim("busy", seconds=float(rest[0]))
+            case b"bound":
+                return Claim("bound", job=rest[0].decode(), fingerprint=rest[1].decode())
+        return Claim("ok")
+
+    def unclaim(self, name: str, job_id: str) -> None:
+        """Give up a claim: the submission was refused or broke off."""
+        self._step("unclaim", job_id, name)
+
     def create(
-        self, record: JobRecord, allowance: Allowance = ANY, uploads: Sequence[str] = ()
+        self,
+        record: JobRecord,
+        allowance: Allowance = ANY,
+        uploads: Sequence[str] = (),
+        *,
+        reuse: bool = False,
+        key: IdempotencyKey | None = None,
     ) -> None:
-        """Store a new record as queued.
+        """Store a new record as queued, or as succeeded where there is a result for it.
 
         Parameters
         ----------
@@ -487,6 +610,10 @@ class RecordStore:
         uploads : sequence of str
             Ids of uploads whose files became those of the job; they are held no longer, nor is an
             upload of the job's own id.
+        reuse : bool
+            Take the result of a job with the same digest, where there is one.
+        key : IdempotencyKey, optional
+            Bound to the job in the same step.
 
         Raises
         ------
@@ -494,37 +621,49 @@ class RecordStore:
             There is a record of this id.
         TooManyJobs, TooManyBytes
             The owner may not have another one.
+        KeyTaken
+            The key of idempotency belongs to another job, or another submission claims it.
         """
         fields: dict[str, str | int] = {
             "options": _encode(record.options),
             "inputs": _encode({r: dataclasses.asdict(f) for r, f in record.inputs.items()}),
         }
-        for name in ("name", "frames", "points"):
+        for name in ("name", "batch", "priority", "ttl", "digest", "frames", "points"):
             value = getattr(record, name)
             if value is not None:
                 fields[name] = value
         flat = [part for item in fields.items() for part in item]
         owner = record.owner or ""
-        limits = ("" if n is None else n for n in (allowance.jobs, allowance.bytes))
-        size = sum(file.bytes for file in record.inputs.values())
-        nonce = uuid.uuid4().hex
-        match self._step(
-            "create", record.id, owner, nonce, *limits, size, ",".join(uploads), *flat
-        ):
+        terms = {
+            "most_jobs": allowance.jobs,
+            "most_bytes": allowance.bytes,
+            "bytes": sum(file.bytes for file in record.inputs.values()),
+            "uploads": [record.id, *uploads],
+            "reuse": reuse,
+            "ttl": self.result_ttl,
+            "key": None if key is None else dataclasses.asdict(key),
+        }
+        given = _encode({name: value for name, value in terms.items() if value is not None})
+        match self._step("create", record.id, owner, uuid.uuid4().hex, given, *flat):
             case b"exists":
                 raise JobExists(record.id)
+            case b"taken":
+                raise KeyTaken(record.id)
             case b"busy":
                 raise TooManyJobs(owner)
             case b"full":
                 raise TooManyBytes(owner)
 
-    def assign_ticket(self, job_id: str, ticket: str) -> str | None:
-        """Note the RQ job that carries this job; return the one it replaces, '' for none.
+    def assign_ticket(self, job_id: str, ticket: str) -> tuple[str, Priority] | None:
+        """Note the RQ job that carries this job; return the one it replaces and the priority.
 
-        None when the job is not queued (any more).
+        '' for none replaced; None when the job is not queued (any more).
         """
-        former = self._step("ticket", job_id, ticket)
-        return None if former is None else cast("bytes", former).decode()
+        answer = self._step("ticket", job_id, ticket)
+        if answer is None:
+            return None
+        former, priority = answer
+        return former.decode(), priority.decode()
 
     def cancel(
         self, job_id: str
@@ -546,8 +685,11 @@ class RecordStore:
 
     def delete(
         self, job_id: str, *, only_expired: bool = False, again: float = 0
-    ) -> tuple[Literal["ok", "gone", "kept"], str]:
+    ) -> tuple[Literal["ok", "gone", "kept"], str, Sequence[str]]:
         """Remove a record and put its objects on the list of garbage.
+
+        Returns what came of it, the job's ticket ('' for none) and the storage prefixes of which
+        nothing is needed any more: results that another job has taken over stay.
 
         Parameters
         ----------
@@ -558,8 +700,9 @@ class RecordStore:
             Seconds until its objects are removed by maintenance: the caller removes them at once,
             and a worker that did not notice yet may write some more.
         """
-        outcome, *ticket = self._step("delete", job_id, str(int(only_expired)), again)
-        return outcome.decode(), ticket[0].decode() if ticket else ""
+        answer = self._step("delete", job_id, str(int(only_expired)), again)
+        outcome, ticket, *unwanted = [part.decode() for part in answer]
+        return outcome, ticket, unwanted
 
     # The worker's steps
 
@@ -624,6 +767,8 @@ class RecordStore:
         fields += ["progress", _encode(dataclasses.asdict(Progress("done", 1.0)))]
         if metrics is not None:
             fields += ["metrics", _encode(metrics)]
+            if "e3d" in metrics:
+                fields += ["e3d", metrics["e3d"]]
         stages = {name: s for name, s in timings.items() if name not in _NO_STAGES}
         return self._verdict(
             "publish",
@@ -725,6 +870,11 @@ def decode(job_id: str, found: Mapping[bytes, bytes]) -> JobRecord | None:
         inputs={role: InputFile(**file) for role, file in documents["inputs"].items()},
         name=texts.get("name"),
         owner=texts.get("owner") or None,
+        batch=texts.get("batch"),
+        priority=cast("Priority", texts.get("priority", "normal")),
+        ttl=number("ttl"),
+        digest=texts.get("digest"),
+        reused_from=texts.get("reused_from"),
         frames=integer("frames"),
         points=integer("points"),
         attempt=int(texts["attempt"]),
@@ -751,8 +901,16 @@ def _slug(problem: Mapping[str, Any]) -> str:
     return str(problem.get("type", "unknown")).rpartition("/")[2]
 
 
-def _index(status: Status | None, owner: str | None) -> str:
-    return f"{PREFIX}:jobs" + (f"@{owner}" if owner else "") + (f":{status}" if status else "")
+def index_key(
+    status: Status | None = None, owner: str | None = None, batch: str | None = None
+) -> str:
+    """Return the key of the sorted set of jobs, of all or of a status, an owner, a batch."""
+    return f"{PREFIX}:jobs{scope_of(owner, batch)}" + (f":{status}" if status else "")
+
+
+def scope_of(owner: str | None, batch: str | None = None) -> str:
+    """Return the ending of the names of keys that are kept for an owner, a batch, or all."""
+    return (f"@{owner}" if owner else "") + (f"#{batch}" if batch else "")
 
 
 def _parse_cursor(cursor: str | None) -> tuple[float, str] | None:

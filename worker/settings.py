@@ -67,6 +67,13 @@ class Settings(BaseSettings):
         description="Longest time for which a job may ask to be kept; 0 sets no limit. A job may "
         "always ask for `result_ttl_seconds`.",
     )
+    reuse_results: bool = Field(
+        default=True,
+        description="Whether a job that does not say takes the result of an equal one.",
+    )
+    idempotency_seconds: float = Field(
+        default=DAY, gt=0, description="How long an Idempotency-Key is remembered."
+    )
     orphan_grace_seconds: float = Field(
         default=DAY,
         gt=0,

@@ -25,6 +25,7 @@ from rq.worker import WorkerStatus
 from worker.cgroup import out_of_memory_kills
 from worker.problems import OutOfMemory, TimeLimitExceeded, WorkerLost, problem_document
 from worker.processes import die_with_parent, raise_after
+from worker.queue import queue_names
 from worker.scratch import empty_folder
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ class Supervisor(Worker):
         # is not to connect before RQ has given it the patience for its long waits.
         queue.redis.delete(self.redis_worker_namespace_prefix + name)
         super().__init__(
-            [queue.settings.queue],
+            list(queue_names(queue.settings.queue).values()),
             name=name,
             connection=connection,
             serializer=JSONSerializer,

@@ -7,6 +7,15 @@
 --   job:{id}                     hash: the record (documents inside it are JSON text)
 --   jobs, jobs:{status}          sorted sets of ids by time of creation
 --   jobs@{owner}[:{status}]      the same for the jobs of one owner
+--   jobs[@{owner}]#{batch}[:{status}]  the same for the jobs of one batch
+--   jobs:queued:{priority}       the same for the queued jobs of one priority
+--   batches[@{owner}]            sorted set of the labels of batches by their latest job's creation
+--   e3d, seconds, ended[@{owner}]#{batch}  sorted sets of the jobs of a batch by the error and run
+--                                time of those that succeeded and by the end of all that have ended
+--   equal:{digest}               sorted set of the succeeded jobs of one digest by their end
+--   holders:{result prefix}      set of the jobs whose result this is, once another job took it over
+--   idempotency:{name}           hash: the job that claims a key, and the fingerprint of its
+--                                submission once there is such a job
 --   leases                       sorted set of running ids by the end of their lease
 --   expiry                       sorted set of finished ids by the end of their time to live
 --   garbage                      sorted set of storage prefixes by the time they are to be removed
@@ -47,24 +56,61 @@ local function changed(job)
   redis.call('PUBLISH', prefix .. 'changed:' .. job, version .. ' ' .. (read(key, 'owner') or ''))
 end
 
-local function indices(owner, status)
-  local names = { prefix .. 'jobs' .. status }
-  if owner and owner ~= '' then
-    names[2] = prefix .. 'jobs@' .. owner .. status
+-- Endings of the names of keys that exist for all jobs and for those of an owner.
+local function scopes(owner)
+  return (owner and owner ~= '') and { '', '@' .. owner } or { '' }
+end
+
+-- The indices in which a job stands for a status, or for having any ('').
+local function indices(key, status)
+  local owner, batch, priority = unpack(redis.call('HMGET', key, 'owner', 'batch', 'priority'))
+  local names = {}
+  for _, scope in ipairs(scopes(owner)) do
+    names[#names + 1] = prefix .. 'jobs' .. scope .. status
+    if batch then
+      names[#names + 1] = prefix .. 'jobs' .. scope .. '#' .. batch .. status
+    end
+  end
+  if status == ':queued' then
+    names[#names + 1] = prefix .. 'jobs:queued:' .. (priority or 'normal')
   end
   return names
 end
 
-local function set_status(job, to)
+local function enter(job, status)
   local key = prefix .. 'job:' .. job
-  local owner, from, created = read(key, 'owner'), read(key, 'status'), read(key, 'created_at')
-  for _, index in ipairs(indices(owner, ':' .. from)) do
-    redis.call('ZREM', index, job)
-  end
-  for _, index in ipairs(indices(owner, ':' .. to)) do
+  local created = read(key, 'created_at')
+  for _, index in ipairs(indices(key, status)) do
     redis.call('ZADD', index, created, job)
   end
+end
+
+local function leave(job, status)
+  for _, index in ipairs(indices(prefix .. 'job:' .. job, status)) do
+    redis.call('ZREM', index, job)
+  end
+end
+
+local function set_status(job, to)
+  local key = prefix .. 'job:' .. job
+  leave(job, ':' .. read(key, 'status'))
+  enter(job, ':' .. to)
   redis.call('HSET', key, 'status', to)
+end
+
+-- Notes a number of a job for the summary of its batch; nil takes it out.
+local function tally(job, name, value)
+  local owner, batch = unpack(redis.call('HMGET', prefix .. 'job:' .. job, 'owner', 'batch'))
+  if batch then
+    for _, scope in ipairs(scopes(owner)) do
+      local key = prefix .. name .. scope .. '#' .. batch
+      if value then
+        redis.call('ZADD', key, value, job)
+      else
+        redis.call('ZREM', key, job)
+      end
+    end
+  end
 end
 
 -- Adds to what an owner stores; jobs and uploads without an owner are not counted.
@@ -94,23 +140,51 @@ local function drop_hold(upload)
   end
 end
 
--- Whether an owner stores as much as the limit ('' for none) or more, once some bytes are added.
+-- Whether an owner stores as much as the limit (nil for none) or more, once some bytes are added.
 local function too_much(owner, bytes, limit)
-  return limit ~= '' and owner ~= '' and bytes > 0
+  return limit and owner ~= '' and bytes > 0
     and (tonumber(redis.call('HGET', stored, owner)) or 0) + bytes > tonumber(limit)
 end
 
--- Whether an owner has as many queued and running jobs as the limit ('' for none) or more.
+-- Whether an owner has as many queued and running jobs as the limit (nil for none) or more.
 local function too_many(owner, limit)
-  return limit ~= '' and owner ~= ''
+  return limit and owner ~= ''
     and redis.call('ZCARD', prefix .. 'jobs@' .. owner .. ':queued')
       + redis.call('ZCARD', prefix .. 'jobs@' .. owner .. ':running') >= tonumber(limit)
 end
 
+local function held(result)
+  return redis.call('EXISTS', prefix .. 'holders:' .. result) == 1
+end
+
+-- Puts the results of attempts on the list of garbage, but for one that other jobs hold.
 local function discard_results(job, first, last)
   for attempt = first, last do
-    redis.call('ZADD', garbage, stamp(now), 'results/' .. job .. '/' .. attempt .. '/')
+    local result = 'results/' .. job .. '/' .. attempt .. '/'
+    if not held(result) then
+      redis.call('ZADD', garbage, stamp(now), result)
+    end
   end
+end
+
+-- Takes back what the end of a job has said: its numbers, and its result, which becomes garbage
+-- when no other job holds it.
+local function reopen(job)
+  local key = prefix .. 'job:' .. job
+  local result, digest = unpack(redis.call('HMGET', key, 'result_prefix', 'digest'))
+  for _, name in ipairs({ 'e3d', 'seconds', 'ended' }) do
+    tally(job, name, nil)
+  end
+  if digest then
+    redis.call('ZREM', prefix .. 'equal:' .. digest, job)
+  end
+  if result then
+    redis.call('SREM', prefix .. 'holders:' .. result, job)
+    if not held(result) then
+      redis.call('ZADD', garbage, stamp(now), result)
+    end
+  end
+  redis.call('ZREM', expiry, job)
 end
 
 local function count(name)
@@ -143,22 +217,42 @@ local function size_of(key)
   return 'unknown'
 end
 
--- Ends a job; a time to live of 0 keeps it for ever.
+-- Ends a job, without counting it. The time to live is the job's own or the one given; 0 keeps it
+-- for ever.
+local function close(job, status, ttl)
+  local key = prefix .. 'job:' .. job
+  local own, digest, e3d = unpack(redis.call('HMGET', key, 'ttl', 'digest', 'e3d'))
+  ttl = tonumber(own or ttl)
+  redis.call('ZREM', leases, job)
+  redis.call('HDEL', key, 'worker', 'suspected_at', 'cancel_requested_at')
+  redis.call('HSET', key, 'finished_at', stamp(now))
+  if ttl > 0 then
+    redis.call('HSET', key, 'expires_at', stamp(now + ttl))
+    redis.call('ZADD', expiry, stamp(now + ttl), job)
+  end
+  tally(job, 'ended', stamp(now))
+  if status == 'succeeded' then
+    tally(job, 'e3d', e3d or nil)
+    if digest then
+      redis.call('ZADD', prefix .. 'equal:' .. digest, stamp(now), job)
+    end
+  end
+  set_status(job, status)
+  changed(job)
+end
+
+-- Ends a job that was to be run.
 local function finish(job, status, ttl)
   local key = prefix .. 'job:' .. job
   count('ended:' .. status)
   if read(key, 'status') == 'running' then
-    observe('run:' .. size_of(key), now - read(key, 'started_at'))
+    local seconds = now - read(key, 'started_at')
+    observe('run:' .. size_of(key), seconds)
+    if status == 'succeeded' then
+      tally(job, 'seconds', stamp(seconds))
+    end
   end
-  redis.call('ZREM', leases, job)
-  redis.call('HDEL', key, 'worker', 'suspected_at', 'cancel_requested_at')
-  redis.call('HSET', key, 'finished_at', stamp(now))
-  if tonumber(ttl) > 0 then
-    redis.call('HSET', key, 'expires_at', stamp(now + ttl))
-    redis.call('ZADD', expiry, stamp(now + ttl), job)
-  end
-  set_status(job, status)
-  changed(job)
+  close(job, status, ttl)
 end
 
 local function fail(job, problem, slug, ttl)
@@ -214,49 +308,130 @@ end
 
 local steps = {}
 
--- owner, nonce, most active jobs and stored bytes of the owner ('' for any), bytes of the inputs, ids
--- of the uploads (with commas) whose holds end as this job begins, then field, value, ...
--- -> 'ok' | 'exists' | 'busy' | 'full'
-function steps.create(owner, nonce, most_jobs, most_bytes, bytes, uploads, ...)
+-- Returns the latest job of a digest that will not be removed for being too old.
+local function equal(digest)
+  for _, job in ipairs(redis.call('ZREVRANGE', prefix .. 'equal:' .. digest, 0, 9)) do
+    local due = redis.call('ZSCORE', expiry, job)
+    if not due or tonumber(due) > now then
+      return job
+    end
+  end
+  return nil
+end
+
+-- Makes the result of a job that of this one, too, which thereby has succeeded.
+local function take_over(job, ttl)
+  local key = prefix .. 'job:' .. job
+  redis.call('SADD', prefix .. 'holders:' .. read(key, 'result_prefix'), job, id)
+  for _, field in ipairs({ 'result_prefix', 'frames', 'points', 'metrics', 'e3d', 'progress' }) do
+    local value = read(key, field)
+    if value then
+      redis.call('HSET', record, field, value)
+    end
+  end
+  redis.call('HSET', record, 'reused_from', read(key, 'reused_from') or job,
+    'timings', '{"queued":0.0,"total":0.0}')
+  charge(id, 'result_bytes', tonumber(read(key, 'result_bytes') or 0))
+  count('reused')
+  close(id, 'succeeded', ttl)
+end
+
+-- Whether a key of idempotency is another job's, or the job's own already.
+local function taken(key)
+  local job, fingerprint = unpack(redis.call('HMGET', key, 'job', 'fingerprint'))
+  return fingerprint or (job and job ~= id)
+end
+
+-- owner, nonce, terms (JSON), then field, value, ... -> 'ok' | 'exists' | 'taken' | 'busy' | 'full'
+-- The terms: most_jobs and most_bytes that the owner may have (absent for any), bytes of the inputs,
+-- ids of the uploads whose holds end as this job begins, whether it may reuse the result of an equal
+-- job, its ttl then, and a key of idempotency (name, fingerprint, seconds to keep it), or none.
+function steps.create(owner, nonce, terms, ...)
   local known = read(record, 'nonce')
   if known then
     return known == nonce and 'ok' or 'exists'
   end
-  if too_many(owner, most_jobs) then
+  terms = cjson.decode(terms)
+  local fields = { ... }
+  local given = {}
+  for k = 1, #fields, 2 do
+    given[fields[k]] = fields[k + 1]
+  end
+  local key = terms.key and prefix .. 'idempotency:' .. terms.key.name
+  if key and taken(key) then
+    return 'taken'
+  end
+  local source = terms.reuse and given.digest and equal(given.digest)
+  if not source and too_many(owner, terms.most_jobs) then
     return 'busy'
   end
-  local held = 0
-  for upload in (id .. ',' .. uploads):gmatch('[^,]+') do
-    held = held + (tonumber(read(prefix .. 'hold:' .. upload, 'bytes')) or 0)
+  local before = 0
+  for _, upload in ipairs(terms.uploads) do
+    before = before + (tonumber(read(prefix .. 'hold:' .. upload, 'bytes')) or 0)
   end
-  if too_much(owner, bytes - held, most_bytes) then
+  if too_much(owner, terms.bytes - before, terms.most_bytes) then
     return 'full'
   end
-  for upload in (id .. ',' .. uploads):gmatch('[^,]+') do
+  for _, upload in ipairs(terms.uploads) do
     drop_hold(upload)
   end
   redis.call('HSET', record, 'status', 'queued', 'created_at', stamp(now),
     'queued_at', stamp(now), 'owner', owner, 'nonce', nonce, 'attempt', 0, 'lost_attempts', 0,
     ...)
-  charge(id, 'input_bytes', tonumber(bytes))
-  for _, status in ipairs({ '', ':queued' }) do
-    for _, index in ipairs(indices(owner, status)) do
-      redis.call('ZADD', index, stamp(now), id)
+  charge(id, 'input_bytes', terms.bytes)
+  enter(id, '')
+  enter(id, ':queued')
+  if given.batch then
+    for _, scope in ipairs(scopes(owner)) do
+      redis.call('ZADD', prefix .. 'batches' .. scope, stamp(now), given.batch)
     end
   end
-  changed(id)
+  if key then
+    redis.call('HSET', key, 'job', id, 'fingerprint', terms.key.fingerprint)
+    redis.call('PEXPIRE', key, math.ceil(terms.key.seconds * 1000))
+  end
+  if source then
+    take_over(source, terms.ttl)
+  else
+    changed(id)
+  end
   return 'ok'
 end
 
--- ticket -> the ticket that it replaces ('' for none), or nil when the job is not queued
+-- id is that of a job that may come to be; name of a key of idempotency, seconds until the claim
+-- lapses unless it is renewed -> {'ok'} | {'busy', seconds} | {'bound', job, fingerprint}
+function steps.claim(name, lease)
+  local key = prefix .. 'idempotency:' .. name
+  local job, fingerprint = unpack(redis.call('HMGET', key, 'job', 'fingerprint'))
+  if fingerprint then
+    return { 'bound', job, fingerprint }
+  end
+  if job and job ~= id then
+    return { 'busy', stamp(redis.call('PTTL', key) / 1000) }
+  end
+  redis.call('HSET', key, 'job', id)
+  redis.call('PEXPIRE', key, math.ceil(lease * 1000))
+  return { 'ok' }
+end
+
+-- name of a key of idempotency -> 'ok'; a claim of this job is given up
+function steps.unclaim(name)
+  local key = prefix .. 'idempotency:' .. name
+  if read(key, 'job') == id and not taken(key) then
+    redis.call('DEL', key)
+  end
+  return 'ok'
+end
+
+-- ticket -> {the ticket that it replaces ('' for none), priority}, or nil when the job is not queued
 function steps.ticket(ticket)
   if read(record, 'status') ~= 'queued' then
     return nil
   end
-  local former = read(record, 'ticket') or ''
+  local former, priority = unpack(redis.call('HMGET', record, 'ticket', 'priority'))
   redis.call('HSET', record, 'ticket', ticket)
   redis.call('HDEL', record, 'missing_since')
-  return former == ticket and '' or former
+  return { (former and former ~= ticket) and former or '', priority or 'normal' }
 end
 
 -- worker, ticket, lease seconds -> {'ok', attempt} | {'busy' | 'finished' | 'gone'}
@@ -447,53 +622,74 @@ function steps.retry(most_jobs)
   if status == 'queued' or status == 'running' then
     return 'active'
   end
-  if too_many(read(record, 'owner'), most_jobs) then
+  if too_many(read(record, 'owner'), tonumber(most_jobs)) then
     return 'busy'
   end
+  reopen(id)
   discard_results(id, 1, tonumber(read(record, 'attempt')))
   charge(id, 'result_bytes', 0)
-  redis.call('HDEL', record, 'problem', 'metrics', 'timings', 'result_prefix', 'progress',
-    'started_at', 'finished_at', 'expires_at')
+  redis.call('HDEL', record, 'problem', 'metrics', 'e3d', 'timings', 'result_prefix', 'reused_from',
+    'progress', 'started_at', 'finished_at', 'expires_at')
   redis.call('HSET', record, 'lost_attempts', 0, 'queued_at', stamp(now))
-  redis.call('ZREM', expiry, id)
   set_status(id, 'queued')
   changed(id)
   return 'ok'
 end
 
 -- '1' to delete only what has outlived its time, seconds until the objects are looked for again
--- -> {'ok' | 'gone' | 'kept', ticket}
+-- -> {'ok' | 'gone' | 'kept', ticket, storage prefixes of which nothing is needed}
 function steps.delete(only_expired, again)
   local status = read(record, 'status')
   if not status then
     redis.call('ZREM', expiry, id)
-    return { 'gone' }
+    return { 'gone', '' }
   end
   if only_expired == '1' then
     local due = redis.call('ZSCORE', expiry, id)
     if not due or tonumber(due) > now then
-      return { 'kept' }
+      return { 'kept', '' }
     end
   end
-  local owner, ticket = read(record, 'owner'), read(record, 'ticket') or ''
-  for _, part in ipairs({ '', ':' .. status }) do
-    for _, index in ipairs(indices(owner, part)) do
-      redis.call('ZREM', index, id)
+  local owner, batch, ticket, attempts =
+    unpack(redis.call('HMGET', record, 'owner', 'batch', 'ticket', 'attempt'))
+  local result = read(record, 'result_prefix')
+  reopen(id)
+  leave(id, '')
+  leave(id, ':' .. status)
+  if batch then
+    for _, scope in ipairs(scopes(owner)) do
+      if redis.call('EXISTS', prefix .. 'jobs' .. scope .. '#' .. batch) == 0 then
+        redis.call('ZREM', prefix .. 'batches' .. scope, batch)
+      end
     end
-  end
-  for attempt = 1, tonumber(read(record, 'attempt')) do
-    redis.call('ZREM', garbage, 'results/' .. id .. '/' .. attempt .. '/')
   end
   redis.call('ZREM', leases, id)
-  redis.call('ZREM', expiry, id)
   charge(id, 'input_bytes', 0)
   charge(id, 'result_bytes', 0)
   redis.call('DEL', record)
-  for _, folder in ipairs({ 'uploads/', 'results/' }) do
-    redis.call('ZADD', garbage, stamp(now + again), folder .. id .. '/')
+  local unwanted, shared = {}, false
+  for attempt = 1, tonumber(attempts) do
+    local own = 'results/' .. id .. '/' .. attempt .. '/'
+    redis.call('ZREM', garbage, own)
+    if held(own) then
+      shared = true
+    else
+      unwanted[#unwanted + 1] = own
+    end
+  end
+  if not shared then
+    unwanted = { 'results/' .. id .. '/' }
+  end
+  local foreign = result and not result:find('results/' .. id .. '/', 1, true)
+  if foreign and not held(result) then
+    unwanted[#unwanted + 1] = result
+  end
+  unwanted[#unwanted + 1] = 'uploads/' .. id .. '/'
+  for _, folder in ipairs(unwanted) do
+    redis.call('ZADD', garbage, stamp(now + again), folder)
   end
   redis.call('PUBLISH', prefix .. 'changed:' .. id, 'deleted ' .. (owner or ''))
-  return { 'ok', ticket }
+  return { 'ok', ticket or '', unpack(unwanted) }
 end
 
 -- -> 'ok'; the files of the job's inputs are gone, the record stays
@@ -509,7 +705,7 @@ end
 function steps.hold(owner, bytes, most_bytes, seconds)
   local key = prefix .. 'hold:' .. id
   local more = bytes - (tonumber(read(key, 'bytes')) or 0)
-  if too_much(owner, more, most_bytes) then
+  if too_much(owner, more, tonumber(most_bytes)) then
     return 'full'
   end
   add_stored(owner, more)

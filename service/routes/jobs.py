@@ -12,7 +12,7 @@ from service.context import Context, JobId, Shared, root_of, unknown_job
 from service.downloads import diagnostics_of
 from service.problems import Problem, example_responses
 from service.schemas import Job, JobList, JobStatus, job_document
-from service.submissions import accept, settings_schema
+from service.submissions import Label, accept, settings_schema
 from service.uploads import UploadLimits, receive_submission
 from service.waiting import preferred_wait, wait_until_final
 from smsr.options import describe
@@ -158,6 +158,7 @@ async def list_jobs(
     response: Response,
     shared: Shared,
     status: Annotated[JobStatus | None, Query(description="Only jobs of this status.")] = None,
+    batch: Annotated[Label | None, Query(description="Only jobs of this batch.")] = None,
     limit: Annotated[int, Query(ge=1, le=PAGE_SIZE, description="Jobs on a page.")] = 50,
     cursor: Annotated[
         str | None, Query(max_length=100, description="From `next` of the page before.")
@@ -166,7 +167,9 @@ async def list_jobs(
     """Return one page of jobs. Jobs that come or go in between do not shift the pages."""
     try:
         page = await to_thread.run_sync(
-            partial(shared.queue.records.list, status, cursor, limit, owner=shared.owner)
+            partial(
+                shared.queue.records.list, status, cursor, limit, owner=shared.owner, batch=batch
+            )
         )
     except ValueError:
         raise Problem(
@@ -175,7 +178,7 @@ async def list_jobs(
     root = root_of(request)
     following = None
     if page.next_cursor is not None:
-        query = {"status": status, "limit": limit, "cursor": page.next_cursor}
+        query = {"status": status, "batch": batch, "limit": limit, "cursor": page.next_cursor}
         given = {name: value for name, value in query.items() if value is not None}
         following = f"{root}/v1/jobs?{urlencode(given)}"
         response.headers["Link"] = f'<{following}>; rel="next"'

@@ -133,6 +133,7 @@ def settings_for(folder: Path, redis: RedisProcess, **more: Any) -> Settings:
         "max_array_bytes": ARRAY_LIMIT,
         "threads": 1,
         "progress_interval_seconds": 0.05,
+        "reuse_results": False,
     }
     return Settings(**{**given, **more})
 

@@ -29,7 +29,7 @@ from tests.service.conftest import (
 )
 from worker.counters import BOUNDS
 from worker.pool import WorkerPool
-from worker.records import FINAL, STATUSES, JobRecord, RecordStore, new_job_id
+from worker.records import FINAL, PRIORITIES, STATUSES, JobRecord, RecordStore, new_job_id
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -121,7 +121,9 @@ def test_a_success_and_a_failure_are_counted_once_and_by_all(
     assert grown("smsr_job_run_seconds_count", size="small") == 2
     assert grown("smsr_attempts_lost_total") == 0
     assert after.value("smsr_workers_alive") == after.value("smsr_up") == 1
-    assert after.value("smsr_queue_depth", queue=first.settings.queue) == 0
+    for priority in PRIORITIES:
+        depth = after.value("smsr_queue_depth", queue=first.settings.queue, priority=priority)
+        assert depth == 0
     for stage, seconds in good["timings"].items():
         if stage not in ("queued", "total"):
             assert grown("smsr_stage_seconds_count", stage=stage) == 1

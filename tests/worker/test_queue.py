@@ -62,10 +62,10 @@ def test_a_crash_between_record_and_ticket_is_repaired(
 
 def test_a_lost_ticket_is_replaced(queue: JobQueue, submit: Submitter, settings: Settings) -> None:
     job_id = submit()
-    (ticket,) = queue.rq.job_ids
-    queue.redis.rpop(queue.rq.key)  # taken by a worker that dies at once
+    (ticket,) = queue.queues["normal"].job_ids
+    queue.redis.rpop(queue.queues["normal"].key)  # taken by a worker that dies at once
     assert recovered(queue, settings) == {job_id}
-    (present,) = queue.rq.job_ids
+    (present,) = queue.queues["normal"].job_ids
     assert present != ticket
     assert queue.redis.ttl(f"rq:job:{ticket}") > 0
     assert queue.redis.ttl(f"rq:job:{present}") == -1
@@ -75,8 +75,8 @@ def test_a_job_of_a_silent_worker_is_queued_first(
     queue: JobQueue, submit: Submitter, settings: Settings
 ) -> None:
     lost, waiting = submit(), submit()
-    (taken, _) = queue.rq.job_ids
-    queue.redis.lmove(queue.rq.key, queue.rq.intermediate_queue_key)
+    (taken, _) = queue.queues["normal"].job_ids
+    queue.redis.lmove(queue.queues["normal"].key, queue.queues["normal"].intermediate_queue_key)
     queue.records.begin_attempt(lost, worker="ann", ticket="t", lease=0.01)
     time.sleep(0.02)
     assert queue.recover().requeued == ()
@@ -84,7 +84,7 @@ def test_a_job_of_a_silent_worker_is_queued_first(
     assert queue.recover().requeued == (lost,)
     assert (queue.position(lost), queue.position(waiting)) == (0, 1)
     assert not [key for key in keys(queue, "*") if taken in key]
-    assert queue.redis.llen(queue.rq.intermediate_queue_key) == 0
+    assert queue.redis.llen(queue.queues["normal"].intermediate_queue_key) == 0
 
 
 def test_cancelling_a_queued_job_leaves_nothing_in_rq(queue: JobQueue, submit: Submitter) -> None:

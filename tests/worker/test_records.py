@@ -106,7 +106,7 @@ def test_an_unknown_job(store: RecordStore) -> None:
     assert store.begin_attempt(job_id, worker="ann", ticket="t", lease=LEASE) is None
     assert store.cancel(job_id) == ("gone", "")
     assert store.retry(job_id) == "gone"
-    assert store.delete(job_id) == ("gone", "")
+    assert store.delete(job_id) == ("gone", "", [])
     assert published(store, job_id, 1) is Verdict.GONE
     assert store.renew(job_id, worker="ann", lease=LEASE).state == "gone"
 
@@ -297,7 +297,8 @@ def test_only_expired_jobs_are_deleted_when_asked_so(store: RecordStore) -> None
 def test_deleting_leaves_only_the_list_of_garbage_and_the_counts(store: RecordStore) -> None:
     job_id = created(store, owner="ann")
     published(store, job_id, begun(store, job_id))
-    assert store.delete(job_id) == ("ok", "")
+    unwanted = [f"results/{job_id}/", f"uploads/{job_id}/"]
+    assert store.delete(job_id) == ("ok", "", unwanted)
     counters = f"{PREFIX}:counters".encode()
     assert set(store.redis.keys("*")) == {counters, f"{PREFIX}:garbage".encode()}
     assert set(store.garbage()) == {f"uploads/{job_id}/", f"results/{job_id}/"}
