@@ -18,13 +18,14 @@ from service.context import Context
 from service.downloads import OpenResults
 from service.lingering import LingeringClose
 from service.metrics import MeasuredRequests, Metrics
-from service.routes import events, health, info, jobs, metrics, results
+from service.routes import events, health, info, jobs, metrics, results, uploads
 from service.routes import problems as problem_pages
 from worker.changes import ChangeFeed
 from worker.connections import connect_async
 from worker.maintenance import Maintenance
 from worker.queue import JobQueue
 from worker.settings import Settings
+from worker.uploads import Digests, UploadStore
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -72,7 +73,10 @@ def create_app(settings: Settings) -> FastAPI:
         queue = JobQueue(settings)
         async with connect_async(redis_url) as redis, ChangeFeed(redis) as feed:
             opened = OpenResults(queue.storage)
-            app.state.context = Context(settings, queue, feed, opened, measured)
+            uploaded = UploadStore(queue.redis, ttl=settings.upload_ttl_seconds)
+            app.state.context = Context(
+                settings, queue, feed, opened, measured, uploaded, Digests()
+            )
             keeper = asyncio.create_task(_keep_order(queue), name="maintenance")
             try:
                 yield
@@ -100,9 +104,10 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.router.redirect_slashes = False
     problems.install(app)
-    for routes in (jobs, events, results, info, health, metrics, problem_pages):
+    for routes in (jobs, events, results, uploads, info, health, metrics, problem_pages):
         app.include_router(routes.router)
         app.include_router(_heads_of(routes.router))
+    app.add_middleware(uploads.TusHeaders)
     app.add_middleware(NoSniff)
     app.add_middleware(
         MeasuredRequests,

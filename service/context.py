@@ -13,6 +13,7 @@ from worker.queue import JobQueue
 from worker.records import JobRecord
 from worker.settings import Settings
 from worker.storage import ObjectStorage
+from worker.uploads import Digests, UploadStore
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,10 @@ class Context:
         Changes of jobs, for those who wait.
     results : OpenResults
     metrics : Metrics
+    uploads : UploadStore
+        Uploads on their own; its calls block.
+    digests : Digests
+        Of the uploads that this process receives.
     owner : str or None
         Whose jobs this request may see and make; None where all clients share all of them.
     """
@@ -37,6 +42,8 @@ class Context:
     feed: ChangeFeed
     results: OpenResults
     metrics: Metrics
+    uploads: UploadStore
+    digests: Digests
     owner: str | None = None
 
     @property

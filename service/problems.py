@@ -21,7 +21,7 @@ from starlette.routing import compile_path
 from smsr import errors
 from worker import problems as worker_problems
 from worker.problems import InternalError, StorageUnavailable
-from worker.storage import ObjectMissing, StorageError
+from worker.storage import ObjectMissing, StorageError, StorageFull
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -167,9 +167,10 @@ _OF_THE_SERVICE = (
     ),
     ProblemType(
         "unsupported-media-type",
-        "The body is not multipart/form-data",
+        "The body is of a type that is not taken here",
         415,
-        "Jobs are submitted as multipart/form-data (RFC 7578) with a boundary.",
+        "Jobs are submitted as multipart/form-data (RFC 7578) with a boundary, or as JSON that "
+        "names finished uploads; a piece of an upload is application/offset+octet-stream.",
         "Send the measurement file as the part `measurements`, for instance with "
         "`curl -F measurements=@tracks.npy`.",
     ),
@@ -233,6 +234,103 @@ _OF_THE_SERVICE = (
         408,
         "No byte of the body arrived for a long time. Nothing of the upload was kept.",
         "Submit again over a better connection.",
+    ),
+    ProblemType(
+        "unknown-upload",
+        "There is no such upload",
+        404,
+        "No upload has this id: it never existed, was deleted, or expired before a job took it.",
+        "Check the id; begin a new upload. `Upload-Expires` says how long one is kept.",
+    ),
+    ProblemType(
+        "upload-used",
+        "A job has taken this upload",
+        409,
+        "An upload becomes the input of one job and is no upload any more.",
+        "Upload the file again for another job; POST /v1/jobs/{id}/retry runs a job again.",
+    ),
+    ProblemType(
+        "upload-exists",
+        "There is an upload of this id",
+        409,
+        "The id is that of an upload that goes on by PATCH.",
+        "Choose another id, or delete the upload.",
+    ),
+    ProblemType(
+        "upload-unfinished",
+        "The upload is not finished",
+        409,
+        "A job was asked for before all bytes of its file had arrived.",
+        "Send the rest from the member `offset` on; then ask for the job again.",
+    ),
+    ProblemType(
+        "upload-offset-mismatch",
+        "The upload stands at another offset",
+        409,
+        "A PATCH must go on where the upload stands, and `Upload-Offset` says something else.",
+        "Ask for the offset by HEAD and go on from there.",
+    ),
+    ProblemType(
+        "upload-superseded",
+        "Another request goes on with this upload",
+        409,
+        "A later request began to write the same upload, and the later one holds.",
+        "Send one request at a time; ask for the offset by HEAD.",
+    ),
+    ProblemType(
+        "malformed-upload",
+        "A header field of the upload cannot be read",
+        400,
+        "`Upload-Length`, `Upload-Offset` or `Upload-Metadata` is missing or malformed, or the id "
+        "is no id.",
+        "See https://tus.io/protocols/resumable-upload for the fields; ids have 32 hexadecimal "
+        "digits.",
+    ),
+    ProblemType(
+        "unsupported-tus-version",
+        "This version of the tus protocol is not spoken",
+        412,
+        "The field `Tus-Resumable` is missing or names another version than 1.0.0.",
+        "Send `Tus-Resumable: 1.0.0`.",
+    ),
+    ProblemType(
+        "malformed-digest",
+        "The digest cannot be read",
+        400,
+        "`Content-Digest`, `Repr-Digest` or `Upload-Checksum` is malformed, or has no algorithm "
+        "that is verified here.",
+        "Send sha-256 or sha-512 (RFC 9530), or a tus checksum with sha1, sha256 or sha512.",
+    ),
+    ProblemType(
+        "digest-mismatch",
+        "The body is not what its digest says",
+        400,
+        "The body was changed on its way, or the digest is that of something else. Nothing of the "
+        "body was kept.",
+        "Send it again.",
+    ),
+    ProblemType(
+        "checksum-mismatch",
+        "The body is not what its checksum says",
+        460,
+        "The bytes do not have the checksum of the field `Upload-Checksum` of the tus protocol. "
+        "Nothing of the body was kept; the offset is what it was.",
+        "Send the same bytes again.",
+    ),
+    ProblemType(
+        "malformed-json",
+        "The body is no JSON object",
+        400,
+        "A job of finished uploads is asked for with one JSON object of at most 128 KiB, in UTF-8.",
+        'Send for instance {"measurements": {"upload": "ID"}, "options": {}}.',
+    ),
+    ProblemType(
+        "storage-full",
+        "There is no room for the files",
+        507,
+        "The disk of the service is full. What was accepted is not lost; an upload by tus goes on "
+        "from its offset when there is room again.",
+        "Try again later; tell the operator if it lasts.",
     ),
     ProblemType(
         "job-unfinished",
@@ -515,6 +613,16 @@ async def _on_storage_away(request: Request, error: Exception) -> ProblemRespons
     )
 
 
+async def _on_storage_full(request: Request, error: Exception) -> ProblemResponse:
+    _log.error("The storage is full", exc_info=error)
+    return respond(
+        request,
+        CATALOGUE["storage-full"],
+        "There is no room for more files at the moment.",
+        headers={"Retry-After": str(60)},
+    )
+
+
 async def _on_object_missing(request: Request, _error: Exception) -> ProblemResponse:
     return respond(
         request, CATALOGUE["result-gone"], "The job and its files were removed a moment ago."
@@ -543,5 +651,6 @@ def install(app: FastAPI) -> None:
     ):
         app.add_exception_handler(away, _on_redis_away)
     app.add_exception_handler(StorageError, _on_storage_away)
+    app.add_exception_handler(StorageFull, _on_storage_full)
     app.add_exception_handler(ObjectMissing, _on_object_missing)
     app.add_exception_handler(Exception, _on_anything_else)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from smsr.options import OptionDescription
     from worker.records import JobRecord
+    from worker.uploads import Upload
 
 JobStatus = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
@@ -52,6 +53,35 @@ class InputFile(BaseModel):
     content_type: str | None
     sha256: str = Field(description="Hexadecimal digest of the bytes that were stored.")
     link: str = Field(description="Path of the file; a job that failed for its input keeps none.")
+
+
+class UploadLinks(BaseModel):
+    """Where to go from an upload; paths relative to the service."""
+
+    self: str
+    job: str | None = Field(description="The job that took it.")
+
+
+class UploadDocument(BaseModel):
+    """An upload on its own."""
+
+    id: str = Field(examples=[_ID])
+    name: str = Field(description="File name as it was sent, without folders.")
+    content_type: str | None
+    role: str | None = Field(description="measurements, ground_truth or faces, where it was said.")
+    bytes: int = Field(description="In all.")
+    offset: int = Field(description="Bytes that are safe: an upload goes on from here.")
+    complete: bool = Field(description="Whether a job can be made of it.")
+    sha256: str | None = Field(description="Hexadecimal digest, once it is complete.")
+    created_at: datetime
+    expires_at: datetime = Field(description="When it is removed if no job takes it.")
+    links: UploadLinks
+
+
+class UploadList(BaseModel):
+    """Uploads that no job has taken, newest first."""
+
+    uploads: list[UploadDocument]
 
 
 class JobProgress(BaseModel):
@@ -358,6 +388,26 @@ def job_document(
             faces=f"{here}/faces.npy" if done and "faces" in record.inputs else None,
             glb=f"{here}/result.glb" if done else None,
             report=f"{here}/report.json" if done else None,
+        ),
+    )
+
+
+def upload_document(upload: Upload, *, root: str = "") -> UploadDocument:
+    """Return the document of an upload."""
+    return UploadDocument(
+        id=upload.id,
+        name=upload.name,
+        content_type=upload.content_type,
+        role=upload.role,
+        bytes=upload.length,
+        offset=upload.offset,
+        complete=upload.complete,
+        sha256=upload.sha256,
+        created_at=_moment(upload.created_at),
+        expires_at=_moment(upload.expires_at),
+        links=UploadLinks(
+            self=f"{root}/v1/uploads/{upload.id}",
+            job=f"{root}/v1/jobs/{upload.job}" if upload.job else None,
         ),
     )
 

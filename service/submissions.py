@@ -158,6 +158,8 @@ class Submission:
     frames, points : int or None
         T and N, where the beginning of the measurements tells them.
     settings : JobSettings
+    from_uploads : bool
+        Whether the files were uploads on their own, which are not lost with the submission.
     """
 
     options: JobOptions
@@ -165,6 +167,7 @@ class Submission:
     frames: int | None
     points: int | None
     settings: JobSettings = field(default_factory=JobSettings)
+    from_uploads: bool = False
 
 
 def digest_of(submission: Submission, owner: str | None) -> str:
@@ -222,7 +225,8 @@ async def accept(shared: Context, job_id: str, submission: Submission) -> JobRec
         accepted = await to_thread.run_sync(shared.queue.records.get, record.id)
         if accepted is not None:
             return accepted
-        await discard_uploads(shared.storage, record.id)
+        if not submission.from_uploads:
+            await discard_uploads(shared.storage, record.id)
         raise
 
 

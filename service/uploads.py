@@ -8,7 +8,6 @@ removed by `worker.maintenance`.
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
 from contextlib import aclosing
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from anyio import CancelScope
+from anyio import CancelScope, to_thread
 from multipart import (
     MultipartError,
     MultipartSegment,
@@ -25,6 +24,8 @@ from multipart import (
     parse_options_header,
 )
 
+from service.bodies import Body
+from service.digests import BodyDigests
 from service.problems import Problem
 from service.submissions import (
     SETTING_BYTES,
@@ -42,7 +43,7 @@ from worker.options import JobOptions
 from worker.records import InputFile, upload_key
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterator
+    from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 
     from starlette.requests import Request
 
@@ -155,6 +156,7 @@ class _Upload:
         self._limits = limits
         self._left = limits.bytes
         self._operator = operator
+        self._digests = BodyDigests.of(request.headers)
         self._options: JobOptions | None = None
         self._given: dict[str, str] = {}
         self._settings = JobSettings()
@@ -193,28 +195,22 @@ class _Upload:
 
     async def _events(self) -> AsyncGenerator[MultipartSegment | bytes | None, None]:
         """Yield what the parser finds: a segment, its bytes, None at its end, and so on."""
-        chunks = self._request.stream()
+        body = Body(self._request, self._limits.idle_seconds)
         received = 0
         try:
-            while True:
-                try:
-                    async with asyncio.timeout(self._limits.idle_seconds):
-                        chunk = await anext(chunks)
-                except StopAsyncIteration:
-                    break
-                except TimeoutError:
-                    raise Problem(
-                        "upload-stalled",
-                        f"No byte arrived for {self._limits.idle_seconds:g} seconds.",
-                        headers={"Connection": "close"},
-                    ) from None
-                received += len(chunk)
+            # The first blocks are small, so that an unusable file is refused at once.
+            while block := await body.block(
+                HEAD_BYTES if received < 4 * HEAD_BYTES else BLOCK_BYTES
+            ):
+                received += len(block)
                 if received > self._limits.body_bytes:
                     raise self._limits.too_large()
-                if chunk:
-                    for event in self._parser.parse(chunk):
-                        yield event
+                if self._digests:
+                    await to_thread.run_sync(self._digests.update, block)
+                for event in self._parser.parse(block):
+                    yield event
             self._parser.close()
+            self._digests.verify()
         except MultipartError as error:
             raise _malformed(error) from None
 
@@ -291,19 +287,45 @@ class _Upload:
 
     def _check_together(self, options: JobOptions) -> tuple[int, int] | tuple[None, None]:
         """Refuse files that do not fit each other or the options; return T and N where known."""
-        self._options = options  # the files may have come first, and be another layout's
-        found = {
-            role: self._check(role, file.name, file.bytes) for role, file in self._inputs.items()
-        }
-        measurements = found["measurements"]
-        if measurements.shape is None or measurements.dtype is None:
-            return None, None
-        size = check_shape(measurements.shape, measurements.dtype, options.layout)
-        truth = found.get("ground_truth")
-        if truth is not None and truth.shape is not None and truth.dtype is not None:
-            # A broadcast zero has the shape without the memory.
-            as_shapes(np.broadcast_to(np.zeros((), truth.dtype), truth.shape), *size)
-        return size
+        files = {role: (file.name, file.bytes) for role, file in self._inputs.items()}
+        return check_files(self._heads, files, options, self._limits.array_bytes)
+
+
+def check_files(
+    heads: Mapping[Role, bytes],
+    files: Mapping[Role, tuple[str, int]],
+    options: JobOptions,
+    array_bytes: int,
+) -> tuple[int, int] | tuple[None, None]:
+    """Refuse files that do not fit each other or the options; return T and N where known.
+
+    Parameters
+    ----------
+    heads : mapping of str to bytes
+        The first bytes by role, as `check_prefix` takes them.
+    files : mapping of str to (str, int)
+        Names and sizes.
+    options : JobOptions
+    array_bytes : int
+        Largest array, decompressed.
+
+    Raises
+    ------
+    smsr.errors.SmsrError
+    """
+    found = {
+        role: check_prefix(heads[role], size, name, role, array_bytes, layout=options.layout)
+        for role, (name, size) in files.items()
+    }
+    measurements = found["measurements"]
+    if measurements.shape is None or measurements.dtype is None:
+        return None, None
+    shape = check_shape(measurements.shape, measurements.dtype, options.layout)
+    truth = found.get("ground_truth")
+    if truth is not None and truth.shape is not None and truth.dtype is not None:
+        # A broadcast zero has the shape without the memory.
+        as_shapes(np.broadcast_to(np.zeros((), truth.dtype), truth.shape), *shape)
+    return shape
 
 
 async def _body(
@@ -372,8 +394,9 @@ def _boundary(request: Request) -> str:
     if kind != "multipart/form-data":
         raise Problem(
             "unsupported-media-type",
-            f"A job is sent as multipart/form-data, not as {kind or 'a body of unknown type'}.",
-            headers={"Accept": "multipart/form-data"},
+            "A job is sent as multipart/form-data, or as JSON that names uploads, not as "
+            f"{kind or 'a body of unknown type'}.",
+            headers={"Accept": "multipart/form-data, application/json"},
         )
     coding = request.headers.get("content-encoding", "identity")
     if coding.lower() != "identity":

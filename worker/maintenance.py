@@ -14,13 +14,14 @@ from redis.exceptions import RedisError
 
 from worker.records import PREFIX
 from worker.storage import StorageError
+from worker.uploads import UploadStore, folder_prefix
 
 if TYPE_CHECKING:
     from worker.queue import JobQueue
 
 ORPHAN_LOOK_SECONDS = 3600.0
 
-_OBJECT = re.compile(r"(?P<kind>uploads|results)/(?P<job>[^/]+)/(?:(?P<attempt>\d+)/)?")
+_OBJECT = re.compile(r"(?P<kind>uploads|results|incoming)/(?P<job>[^/]+)/(?:(?P<attempt>\d+)/)?")
 
 log = structlog.get_logger(__name__)
 
@@ -35,6 +36,7 @@ class Maintenance:
 
     def __init__(self, queue: JobQueue) -> None:
         self.queue = queue
+        self.uploads = UploadStore(queue.redis, ttl=queue.settings.upload_ttl_seconds)
 
     def run_once(self) -> None:
         """Do all that is due; failures of Redis or of the storage are left for the next time."""
@@ -42,6 +44,7 @@ class Maintenance:
             self.queue.recover,
             self.expire,
             self.queue.records.lapse_holds,
+            self.expire_uploads,
             self.collect_garbage,
             self.collect_orphans,
         ):
@@ -55,6 +58,19 @@ class Maintenance:
         for job_id in self.queue.records.expired():
             if self.queue.delete(job_id, only_expired=True):
                 log.info("job expired", job=job_id)
+
+    def expire_uploads(self) -> None:
+        """Remove the objects of uploads that nobody went on with and no job took."""
+        storage, count, size = self.queue.storage, 0, 0
+        for folder in self.uploads.abandoned():
+            prefix = folder_prefix(folder)
+            found = list(storage.list_prefix(prefix))
+            storage.delete_prefix(prefix)
+            self.uploads.forget_folder(folder)
+            count += bool(found)
+            size += sum(item.bytes for item in found)
+        if count:
+            log.info("abandoned uploads removed", count=count, bytes=size)
 
     def collect_garbage(self) -> None:
         """Remove the objects of deleted jobs and of attempts that came to nothing."""
@@ -78,7 +94,7 @@ class Maintenance:
     def _orphans(self, before: float) -> list[str]:
         """Return prefixes without a record, none of whose objects changed after a time."""
         latest: dict[tuple[str, str, str | None], float] = {}
-        for kind in ("uploads/", "results/"):
+        for kind in ("uploads/", "results/", "incoming/"):
             for item in self.queue.storage.list_prefix(kind):
                 if found := _OBJECT.match(item.key):
                     place = (found["kind"], found["job"], found["attempt"])
@@ -88,6 +104,10 @@ class Maintenance:
             if modified >= before:
                 continue
             prefix = f"{kind}/{job_id}/" + (f"{attempt}/" if attempt else "")
+            if kind == "incoming":
+                if not self.uploads.knows_folder(job_id):
+                    orphans.append(prefix)
+                continue
             record = self.queue.records.get(job_id)
             needed = record is not None and (
                 kind == "uploads"

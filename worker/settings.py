@@ -74,6 +74,11 @@ class Settings(BaseSettings):
     idempotency_seconds: float = Field(
         default=DAY, gt=0, description="How long an Idempotency-Key is remembered."
     )
+    upload_ttl_seconds: float = Field(
+        default=DAY,
+        gt=0,
+        description="How long an upload that no job has taken is kept after its last byte.",
+    )
     orphan_grace_seconds: float = Field(
         default=DAY,
         gt=0,

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import hashlib
 import os
 import re
 import shutil
+import threading
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
@@ -41,6 +43,10 @@ class StorageError(Exception):
 
 class ObjectMissing(StorageError):
     """There is no such object."""
+
+
+class StorageFull(StorageError):
+    """There is no room for more."""
 
 
 class UploadTooLarge(Exception):
@@ -126,6 +132,9 @@ class ObjectStorage:
         meter = _Meter(limit)
         try:
             with _failures(key):
+                if self.folder is not None:
+                    await _write_file(self._local(key), meter, chunks)
+                    return StoredObject(key, meter.bytes, meter.sha256.hexdigest())
                 await obstore.put_async(
                     self._store,
                     _checked(key),
@@ -133,7 +142,6 @@ class ObjectStorage:
                     chunk_size=PART_BYTES,
                     max_concurrency=PARTS_AT_ONCE,
                 )
-                await asyncio.to_thread(self._make_durable, key)
         except StorageError:
             if meter.broken is not None:
                 raise meter.broken from None
@@ -172,6 +180,97 @@ class ObjectStorage:
             else:
                 obstore.put(self._store, _checked(key), path, chunk_size=PART_BYTES)
                 self._make_durable(key)
+
+    def move(self, source: str, target: str) -> None:
+        """Give an object another key, without a copy through this process.
+
+        Doing it again after it succeeded is no error.
+
+        Raises
+        ------
+        ObjectMissing, StorageError
+        """
+        with _failures(source):
+            if self.folder is None:
+                try:
+                    obstore.rename(self._store, _checked(source), _checked(target))
+                except FileNotFoundError:
+                    if not self.exists(target):
+                        raise
+                return
+            old, new = self._local(source), self._local(target)
+            if not old.exists() and new.exists():
+                return
+            new.parent.mkdir(parents=True, exist_ok=True)
+            old.replace(new)
+            _sync(new.parent)
+
+    # Local files that grow
+
+    @contextlib.contextmanager
+    def locked(self, key: str) -> Iterator[int]:
+        """Open a file of a local storage, made if absent, while no other process has it open so.
+
+        Raises
+        ------
+        StorageError
+        """
+        import fcntl  # not on Windows, where only the client is used
+
+        path = self._local(key)
+        with _failures(key):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+                yield descriptor
+            finally:
+                os.close(descriptor)
+
+    def size_of(self, descriptor: int) -> int:
+        """Return the number of bytes of an open file."""
+        return os.fstat(descriptor).st_size
+
+    def write_at(self, descriptor: int, data: bytes, offset: int) -> None:
+        """Write bytes at an offset of an open file, so that they outlast a power cut.
+
+        Raises
+        ------
+        StorageError
+        """
+        with _failures("an upload"):
+            left = memoryview(data)
+            while left:
+                count = os.pwrite(descriptor, left, offset)
+                offset += count
+                left = left[count:]
+            os.fdatasync(descriptor)
+
+    def cut(self, key: str, length: int) -> None:
+        """Remove what stands behind the first `length` bytes of a local file.
+
+        Raises
+        ------
+        StorageError
+            The file is shorter.
+        """
+        path = self._local(key)
+        with _failures(key):
+            if path.stat().st_size < length:
+                raise StorageError(f"{key} has less than {length} bytes")
+            os.truncate(path, length)
+            _sync(path)
+            _sync(path.parent)
+
+    def sha256(self, key: str) -> str:
+        """Return the digest of an object of a local storage.
+
+        Raises
+        ------
+        StorageError
+        """
+        with _failures(key), self._local(key).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
 
     def _take_over(self, target: Path, path: Path) -> None:
         if not path.exists() and target.exists():
@@ -381,20 +480,59 @@ class _Meter:
         self.broken: OSError | None = None
         """An error of the source that must not be taken for one of the storage."""
 
-    async def measure(self, chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
+    async def count(self, chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
+        """Pass chunks on, counted."""
         try:
             async for chunk in chunks:
                 self.bytes += len(chunk)
                 if self.limit is not None and self.bytes > self.limit:
                     raise UploadTooLarge(self.limit)
                 if chunk:
-                    # Hashed beside the loop, while the storage writes and the next bytes arrive.
-                    block = bytes(chunk)
-                    hashing = asyncio.create_task(asyncio.to_thread(self.sha256.update, block))
-                    yield block
-                    await hashing
+                    yield bytes(chunk)
         except OSError as error:
             self.broken = error
+            raise
+
+    async def measure(self, chunks: AsyncIterable[bytes]) -> AsyncIterator[bytes]:
+        """Pass chunks on, counted and hashed."""
+        async for block in self.count(chunks):
+            # Hashed beside the loop, while the storage writes and the next bytes arrive.
+            hashing = asyncio.create_task(asyncio.to_thread(self.sha256.update, block))
+            yield block
+            await hashing
+
+
+async def _write_file(target: Path, meter: _Meter, chunks: AsyncIterable[bytes]) -> None:
+    """Write a file that appears when it is whole; the next bytes arrive while some are written."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # The name is one that obstore takes for an unfinished upload.
+    staged = target.with_name(f"{target.name}#{uuid.uuid4().int}")
+    with staged.open("xb", buffering=0) as file:
+        guard = threading.Lock()  # held by a thread that writes, which a cancelled task leaves
+
+        def write(block: bytes) -> None:
+            with guard:
+                left = memoryview(block)
+                while left and not file.closed:
+                    left = left[file.write(left) :]
+
+        try:
+            writing: asyncio.Future[Any] | None = None
+            async for block in meter.count(chunks):
+                if writing is not None:
+                    await writing
+                writing = asyncio.gather(
+                    asyncio.to_thread(write, block), asyncio.to_thread(meter.sha256.update, block)
+                )
+            if writing is not None:
+                await writing
+            await asyncio.to_thread(os.fsync, file.fileno())
+            staged.replace(target)
+            await asyncio.to_thread(_sync, target.parent)
+        except BaseException:
+            with guard:
+                file.close()
+            staged.unlink(missing_ok=True)
             raise
 
 
@@ -426,4 +564,6 @@ def _failures(key: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise ObjectMissing(f"there is no object {key}") from error
     except (BaseError, OSError) as error:
+        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+            raise StorageFull(f"{key}: {error}") from error
         raise StorageError(f"{key}: {error}") from error

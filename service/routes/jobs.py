@@ -10,10 +10,11 @@ from starlette.requests import ClientDisconnect
 
 from service.context import Context, JobId, Shared, root_of, unknown_job
 from service.downloads import diagnostics_of
+from service.incoming import is_json, limits_of, receive_references
 from service.problems import Problem, example_responses
 from service.schemas import Job, JobList, JobStatus, job_document
 from service.submissions import Label, accept, settings_schema
-from service.uploads import UploadLimits, receive_submission
+from service.uploads import FILES, receive_submission
 from service.waiting import preferred_wait, wait_until_final
 from smsr.options import describe
 from worker.options import JobOptions
@@ -28,6 +29,20 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 def _file(description: str) -> dict[str, Any]:
     return {"type": "string", "format": "binary", "description": description}
+
+
+def _references() -> dict[str, Any]:
+    """Return the JSON Schemas of references to uploads, by role."""
+    return {
+        role: {
+            "type": "object",
+            "description": f"A finished upload with the {role.replace('_', ' ')}.",
+            "required": ["upload"],
+            "additionalProperties": False,
+            "properties": {"upload": {"type": "string", "pattern": "^[0-9a-f]{32}$"}},
+        }
+        for role in FILES
+    }
 
 
 def _options_schema() -> dict[str, Any]:
@@ -48,7 +63,7 @@ def _options_schema() -> dict[str, Any]:
     return {"type": "object", "additionalProperties": False, "properties": properties}
 
 
-_BODY = {
+_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {
@@ -72,7 +87,23 @@ _BODY = {
                 },
                 "encoding": {"options": {"contentType": "application/json"}},
                 "example": {"options": {"layout": "interleaved"}, "measurements": "@tracks.npy"},
-            }
+            },
+            "application/json": {
+                "schema": {
+                    "type": "object",
+                    "required": ["measurements"],
+                    "additionalProperties": False,
+                    "properties": {
+                        "options": _options_schema(),
+                        **_references(),
+                        **settings_schema(),
+                    },
+                },
+                "example": {
+                    "measurements": {"upload": "0f8fad5bd9cb469fa16570867728950e"},
+                    "options": {"layout": "interleaved"},
+                },
+            },
         },
     }
 }
@@ -87,6 +118,13 @@ _BODY = {
         201: {"headers": {"Location": {"schema": {"type": "string"}, "description": "The job."}}},
         **example_responses(
             "malformed-multipart",
+            "malformed-json",
+            "malformed-digest",
+            "digest-mismatch",
+            "unknown-upload",
+            "upload-unfinished",
+            "upload-used",
+            "invalid-request",
             "upload-stalled",
             "upload-too-large",
             "too-large",
@@ -107,6 +145,7 @@ _BODY = {
             "unreadable-file",
             "queue-unavailable",
             "storage-unavailable",
+            "storage-full",
         ),
     },
 )
@@ -118,18 +157,20 @@ async def submit(request: Request, response: Response, shared: Shared) -> Job:
     finite, a corrupt archive) makes the job fail with the same kind of problem document. Nothing of
     a refused or broken upload is kept; the files of a job are kept until it fails for its input,
     expires or is deleted.
+
+    A JSON document makes a job of files that were uploaded before (`/v1/uploads`); the job takes
+    them over. `Content-Digest` and `Repr-Digest` of a multipart body are verified (RFC 9530).
     """
     queue = shared.queue
     await to_thread.run_sync(queue.redis.ping)  # before a long upload, not after it
     job_id = new_job_id()
     try:
-        submission = await receive_submission(
-            request,
-            job_id,
-            shared.storage,
-            UploadLimits(shared.settings.max_upload_bytes, shared.settings.max_array_bytes),
-            shared.settings,
-        )
+        if is_json(request.headers):
+            submission = await receive_references(request, job_id, shared)
+        else:
+            submission = await receive_submission(
+                request, job_id, shared.storage, limits_of(shared), shared.settings
+            )
     except ClientDisconnect:
         raise Problem("malformed-multipart", "The client went away.") from None
     record = await accept(shared, job_id, submission)
