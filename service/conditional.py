@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import dataclass
 from email.utils import formatdate, parsedate_to_datetime
 from typing import TYPE_CHECKING
@@ -49,7 +50,9 @@ class Validators:
     @property
     def headers(self) -> dict[str, str]:
         """The header fields that carry them."""
-        return {"ETag": f'"{self.tag}"', "Last-Modified": formatdate(self.modified, usegmt=True)}
+        # Section 8.8.2.1: never in the future, whatever another machine's clock says.
+        modified = formatdate(min(self.modified, time.time()), usegmt=True)
+        return {"ETag": f'"{self.tag}"', "Last-Modified": modified}
 
     def check(self, headers: Headers) -> None:
         """Evaluate the preconditions of a GET or HEAD in the order of section 13.2.2.

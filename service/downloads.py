@@ -12,7 +12,7 @@ import base64
 import hashlib
 import json
 import re
-import time
+from array import array
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -24,7 +24,8 @@ from starlette.datastructures import Headers
 from starlette.responses import Response, StreamingResponse
 
 import smsr
-from service.archives import Member, archive_size, stream_archive
+from service.archives import LAYOUT, Members, single
+from service.archives import archive as zip_archive
 from service.conditional import (
     NotModified,
     PreconditionFailed,
@@ -32,10 +33,20 @@ from service.conditional import (
     Validators,
     wanted_range,
 )
+from service.content import (
+    WINDOW_BYTES,
+    Content,
+    Windows,
+    held_content,
+    joined,
+    read_range,
+    stored_content,
+)
 from service.problems import Problem
 from smsr.files.glb import Bounds, Glb, GlbOptions
 from smsr.files.npy import HEADER_BYTES, parse_header
 from smsr.files.ply import FACE_BYTES, VERTEX_BYTES, ply_face_block, ply_header
+from worker.checksums import CHECKSUMS, FRAME_CHECKSUMS, parse_checksums
 from worker.storage import ObjectMissing
 
 if TYPE_CHECKING:
@@ -44,6 +55,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from starlette.types import Receive, Scope, Send
 
+    from worker.checksums import FileChecksum
     from worker.records import JobRecord
     from worker.storage import ObjectStorage
 
@@ -51,9 +63,6 @@ ARRAYS = ("shapes.npy", "cameras.npy", "translations.npy", "faces.npy")
 """Arrays of a result as the worker stores them; faces only where faces were sent."""
 
 _KEPT_BOUNDS = 4
-
-WINDOW_BYTES = 3 << 20
-"""Bytes read at once; a multiple of a row of faces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,80 +90,6 @@ async def open_array(storage: ObjectStorage, key: str) -> StoredArray:
     return StoredArray(key, size, header.shape, header.dtype, header.offset)
 
 
-async def read_range(
-    storage: ObjectStorage, key: str, start: int, length: int
-) -> AsyncIterator[bytes]:
-    """Yield a part of an object in windows, the next one being read while one is sent.
-
-    Each window is a request of its own, so that a client that reads slowly holds no connection to
-    the storage open beyond its time limit.
-    """
-
-    def begin(offset: int) -> asyncio.Task[bytes] | None:
-        if offset >= length:
-            return None
-        size = min(WINDOW_BYTES, length - offset)
-        return asyncio.create_task(storage.get_range_async(key, start + offset, size))
-
-    offset = 0
-    ahead = begin(offset)
-    try:
-        while ahead is not None:
-            window = await ahead
-            offset += len(window)
-            ahead = begin(offset)
-            yield window
-    finally:
-        if ahead is not None:
-            ahead.cancel()
-
-
-@dataclass(frozen=True, slots=True)
-class Content:
-    """The bytes of a download.
-
-    Attributes
-    ----------
-    size : int
-        How many there are.
-    read : callable
-        Gives those from a position up to another.
-    seekable : bool
-        Whether `read` can begin elsewhere than at 0.
-    """
-
-    size: int
-    read: Callable[[int, int], AsyncIterator[bytes]]
-    seekable: bool = True
-
-
-def stored_content(storage: ObjectStorage, key: str, size: int, offset: int = 0) -> Content:
-    """Return `size` bytes of an object as they are."""
-    return Content(size, lambda start, stop: read_range(storage, key, offset + start, stop - start))
-
-
-def held_content(data: bytes) -> Content:
-    """Return a few bytes that are at hand."""
-
-    async def read(start: int, stop: int) -> AsyncIterator[bytes]:
-        yield data[start:stop]
-
-    return Content(len(data), read)
-
-
-def joined(parts: Sequence[Content]) -> Content:
-    """Return contents one behind the other."""
-
-    async def read(start: int, stop: int) -> AsyncIterator[bytes]:
-        for part in parts:
-            if start < min(part.size, stop):
-                async for chunk in part.read(max(start, 0), min(part.size, stop)):
-                    yield chunk
-            start, stop = start - part.size, stop - part.size
-
-    return Content(sum(part.size for part in parts), read)
-
-
 def result_validators(record: JobRecord) -> Validators:
     """Return the validators of the files of a result: the same in every process, for ever."""
     prefix = (record.result_prefix or "").encode()
@@ -162,43 +97,43 @@ def result_validators(record: JobRecord) -> Validators:
     began = record.started_at or finished
     return Validators(
         tag=hashlib.sha256(prefix).hexdigest()[:20],
-        modified=min(finished, time.time()),  # section 8.8.2.1: not in the future
+        modified=finished,
         dated=record.attempt == 1 or int(began) < int(finished),
     )
 
 
-class _Cutter:
-    """Cuts a stream of bytes into pieces of given lengths, one after the other."""
+class _Faces:
+    """The triangles of a result as a PLY holds them, made from any row on.
 
-    def __init__(self, chunks: AsyncIterator[bytes]) -> None:
-        self._chunks = chunks
-        self._rest = memoryview(b"")
+    Few ones are kept once they were read: an archive of frames repeats them for each frame.
+    """
 
-    async def cut(self, length: int) -> AsyncIterator[bytes]:
-        """Yield the next `length` bytes, or fewer where the stream ends."""
-        while length > 0:
-            if not self._rest:
-                chunk = await anext(self._chunks, b"")
-                if not chunk:
-                    return
-                self._rest = memoryview(chunk)
-            piece, self._rest = self._rest[:length], self._rest[length:]
-            length -= len(piece)
-            yield bytes(piece)
+    def __init__(self, storage: ObjectStorage, faces: StoredArray) -> None:
+        self._storage = storage
+        self._faces = faces
+        self._kept: bytes | None = None
+        self.content = Content(FACE_BYTES * faces.shape[0], self._read)
 
+    async def _read(self, start: int, stop: int) -> AsyncIterator[bytes]:
+        if self.content.size > WINDOW_BYTES:
+            async for block in self._convert(start, stop):
+                yield block
+            return
+        if self._kept is None:
+            blocks = [block async for block in self._convert(0, self.content.size)]
+            self._kept = b"".join(blocks)
+        yield self._kept[start:stop]
 
-class _Kept:
-    """Chunks that are read the first time they are asked for, and kept for the next times."""
-
-    def __init__(self, read: Callable[[], AsyncIterator[bytes]]) -> None:
-        self._read = read
-        self._chunks: list[bytes] | None = None
-
-    async def __call__(self) -> AsyncIterator[bytes]:
-        if self._chunks is None:
-            self._chunks = [chunk async for chunk in self._read()]
-        for chunk in self._chunks:
-            yield chunk
+    async def _convert(self, start: int, stop: int) -> AsyncIterator[bytes]:
+        faces = self._faces
+        row = faces.dtype.itemsize * 3
+        first, last = start // FACE_BYTES, -(-stop // FACE_BYTES)
+        position = first * FACE_BYTES
+        begin, length = faces.offset + first * row, (last - first) * row
+        async for chunk in read_range(self._storage, faces.key, begin, length):
+            block = ply_face_block(np.frombuffer(chunk, faces.dtype).reshape(-1, 3))
+            yield block[max(start - position, 0) : stop - position]
+            position += len(block)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,9 +143,13 @@ class ResultFiles:
     Attributes
     ----------
     storage : ObjectStorage
+    prefix : str
+        Of the objects of the result.
     shapes, cameras, translations : StoredArray
     faces : StoredArray or None
         None where no faces were sent.
+    checksums : mapping of str to FileChecksum
+        By file; empty for results of earlier versions, whose archives cannot be resumed.
     validators : Validators
         Different for each run of the job; its time is the time stamp of archive members.
     bounds : dict
@@ -218,10 +157,12 @@ class ResultFiles:
     """
 
     storage: ObjectStorage
+    prefix: str
     shapes: StoredArray
     cameras: StoredArray
     translations: StoredArray
     faces: StoredArray | None
+    checksums: Mapping[str, FileChecksum]
     validators: Validators
     bounds: dict[int, Bounds] = field(default_factory=dict)
 
@@ -240,7 +181,13 @@ class ResultFiles:
         opened = await asyncio.gather(*(open_array(storage, prefix + name) for name in names))
         shapes, cameras, translations, *rest = opened
         faces_array = rest[0] if rest else None
-        return cls(storage, shapes, cameras, translations, faces_array, validators)
+        try:
+            checksums = parse_checksums(await to_thread.run_sync(storage.get, prefix + CHECKSUMS))
+        except ObjectMissing:
+            checksums = {}
+        return cls(
+            storage, prefix, shapes, cameras, translations, faces_array, checksums, validators
+        )
 
     @property
     def frames(self) -> int:
@@ -270,69 +217,42 @@ class ResultFiles:
             found["faces.npy"] = self.faces
         return found
 
-    def array(self, array: StoredArray, name: str) -> Download:
+    def array(self, file: str, name: str) -> Download:
         """Answer with one of the arrays, as NumPy reads it."""
-        content = stored_content(self.storage, array.key, array.size)
-        return Download(content, name=name, validators=self.validators)
+        checksum = self.checksums.get(file)
+        return Download(
+            self._stored(self.arrays()[file]),
+            name=name,
+            validators=self.validators,
+            sha256=None if checksum is None else checksum.sha256,
+        )
+
+    def _stored(self, array: StoredArray) -> Content:
+        return stored_content(self.storage, array.key, array.size)
 
     # One frame
 
     def frame(self, t: int, name: str) -> Download:
         """Answer with frame t as a binary little-endian PLY."""
-        block = self._vertex_block
-        vertices = stored_content(
-            self.storage, self.shapes.key, block, self.shapes.offset + t * block
-        )
-        content = joined([held_content(self._ply_header()), vertices, self._faces_content()])
+        content = self._open_frames(range(t, t + 1))(t)
         return Download(content, name=name, validators=self.validators)
 
-    def _faces_content(self) -> Content:
-        """Return the triangles as a PLY holds them, made from any row on."""
-        faces = self.faces
-        if faces is None:
-            return held_content(b"")
-        row = faces.dtype.itemsize * 3
+    def _open_frames(self, frames: range) -> Callable[[int], Content]:
+        """Return what gives the PLY of each of these frames; in order they are one pass."""
+        header = held_content(ply_header(self.points, self.face_count))
+        block = VERTEX_BYTES * self.points
 
-        async def read(start: int, stop: int) -> AsyncIterator[bytes]:
-            first, last = start // FACE_BYTES, -(-stop // FACE_BYTES)
-            position = first * FACE_BYTES
-            rows = read_range(
-                self.storage, faces.key, faces.offset + first * row, (last - first) * row
-            )
-            async for chunk in rows:
-                block = ply_face_block(np.frombuffer(chunk, faces.dtype).reshape(-1, 3))
-                yield block[max(start - position, 0) : stop - position]
-                position += len(block)
+        def begin(t: int) -> int:
+            return self.shapes.offset + t * block
 
-        return Content(FACE_BYTES * self.face_count, read)
+        windows = Windows(self.storage, self.shapes.key, begin(frames.start), begin(frames.stop))
+        faces = [] if self.faces is None else [_Faces(self.storage, self.faces).content]
 
-    def _ply_header(self) -> bytes:
-        return ply_header(self.points, self.face_count)
+        def content(t: int) -> Content:
+            vertices = Content(block, lambda i, j: windows.read(begin(t) + i, begin(t) + j))
+            return joined([header, vertices, *faces])
 
-    def ply_size(self) -> int:
-        """Return the length in bytes of the PLY of any frame."""
-        return len(self._ply_header()) + self._vertex_block + FACE_BYTES * self.face_count
-
-    @property
-    def _vertex_block(self) -> int:
-        return VERTEX_BYTES * self.points
-
-    async def _ply(
-        self, vertices: _Cutter, faces: Callable[[], AsyncIterator[bytes]]
-    ) -> AsyncIterator[bytes]:
-        """Yield a PLY with the vertices that come next."""
-        yield self._ply_header()
-        async for chunk in vertices.cut(self._vertex_block):
-            yield chunk
-        async for chunk in faces():
-            yield chunk
-
-    async def _face_blocks(self) -> AsyncIterator[bytes]:
-        if self.faces is None:
-            return
-        start, end = self.faces.offset, self.faces.size
-        async for chunk in read_range(self.storage, self.faces.key, start, end - start):
-            yield ply_face_block(np.frombuffer(chunk, self.faces.dtype).reshape(-1, 3))
+        return content
 
     # Animation
 
@@ -385,41 +305,45 @@ class ResultFiles:
 
     # Archives
 
-    def archive(self, members: list[Member], name: str) -> Download:
+    def archive(self, groups: Sequence[Members], name: str) -> Download:
         """Answer with a stored ZIP of `npz_members` or `ply_members`."""
-        content = Content(
-            archive_size(members),
-            lambda _start, _stop: stream_archive(members, self.validators.modified),
-            seekable=False,
-        )
+        validators = replace(self.validators, tag=f"{self.validators.tag}-{LAYOUT}")
         return Download(
-            content, name=name, validators=self.validators, media_type="application/zip"
+            zip_archive(groups, self.validators.modified),
+            name=name,
+            validators=validators,
+            media_type="application/zip",
         )
 
-    def npz_members(self) -> list[Member]:
+    def npz_members(self, prefix: str = "") -> list[Members]:
         """Return the members of result.npz, which are the stored files themselves."""
-        return [self._array_member(name, array) for name, array in self.arrays().items()]
-
-    def _array_member(self, name: str, array: StoredArray) -> Member:
-        return Member(name, array.size, lambda: read_range(self.storage, array.key, 0, array.size))
-
-    def ply_members(self) -> list[Member]:
-        """Return the members of frames.zip: every frame, numbered so that names sort."""
-        size = self.ply_size()
-        digits = max(4, len(str(self.frames - 1)))
-        # An archive is read in order, so one pass over the shapes serves all frames.
-        length = self._vertex_block * self.frames
-        vertices = _Cutter(read_range(self.storage, self.shapes.key, self.shapes.offset, length))
-        faces = _Kept(self._face_blocks) if self._keeps_faces else self._face_blocks
+        crc32 = {name: found.crc32 for name, found in self.checksums.items()}
         return [
-            Member(f"frame_{t:0{digits}d}.ply", size, lambda: self._ply(vertices, faces))
-            for t in range(self.frames)
+            single(prefix + name, self._stored(array), crc32.get(name))
+            for name, array in self.arrays().items()
         ]
 
-    @property
-    def _keeps_faces(self) -> bool:
-        """Whether faces are few enough to be held while an archive is sent."""
-        return FACE_BYTES * self.face_count <= WINDOW_BYTES
+    async def ply_members(self) -> list[Members]:
+        """Return the members of frames.zip: every frame, numbered so that names sort."""
+        digits = max(4, len(str(self.frames - 1)))
+        return [
+            Members(
+                count=self.frames,
+                size=self._open_frames(range(0))(0).size,
+                name=lambda t: f"frame_{t:0{digits}d}.ply",
+                open=self._open_frames,
+                checksums=await self._frame_checksums(),
+            )
+        ]
+
+    async def _frame_checksums(self) -> Sequence[int] | None:
+        """Return the CRC-32 of the PLY of each frame, four bytes in memory for each."""
+        if not self.checksums:
+            return None
+        key = self.prefix + FRAME_CHECKSUMS
+        stored = await open_array(self.storage, key)
+        data = await self.storage.get_range_async(key, stored.offset, stored.size - stored.offset)
+        return array("I", np.frombuffer(data, stored.dtype).astype("=u4").tobytes())
 
 
 class OpenResults:

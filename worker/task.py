@@ -23,6 +23,7 @@ from smsr.measurements import as_source
 from smsr.metrics import as_shapes
 from smsr.options import parse
 from smsr.progress import Progress
+from worker.checksums import CHECKSUMS, FRAME_CHECKSUMS, write_checksums
 from worker.connections import connect
 from worker.memory import memory_budget
 from worker.options import JobOptions
@@ -57,7 +58,8 @@ SOLVER_SHARE = 0.9
 
 _INSIST_SECONDS = 600.0
 _REPORT_TIMEOUT = 1.0
-RESULTS = ("shapes.npy", "cameras.npy", "translations.npy", "faces.npy", "report.json")
+ARRAYS = ("shapes.npy", "cameras.npy", "translations.npy", "faces.npy")
+RESULTS = (*ARRAYS, "report.json", CHECKSUMS, FRAME_CHECKSUMS)
 """Objects of a result; faces only where some were given."""
 
 _PAUSES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -226,6 +228,7 @@ class _Attempt:
         report = json.loads(report_path.read_text(encoding="utf-8"))
         report |= {"metrics": metrics, "timings": self.timings}
         report_path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_checksums(self.folder, ARRAYS)
         stored = 0
         for name in RESULTS:
             path = self.folder / name

@@ -8,13 +8,13 @@ from fastapi import APIRouter, Path, Query
 from starlette.responses import StreamingResponse
 
 from service.conditional import Validators
+from service.content import stored_content
 from service.context import Context, JobId, Shared
 from service.downloads import (
     Download,
     ResultFiles,
     result_validators,
     safe_media_type,
-    stored_content,
 )
 from service.problems import Problem, example_responses
 from smsr.files.glb import GlbOptions, ImageV
@@ -97,7 +97,7 @@ async def get_npz(shared: Shared, job_id: JobId) -> Download:
 async def get_frames(shared: Shared, job_id: JobId) -> Download:
     """Return every frame as a binary PLY, with the faces where faces were sent."""
     files = await _open(shared, job_id)
-    return files.archive(files.ply_members(), f"smsr-{job_id}-frames.zip")
+    return files.archive(await files.ply_members(), f"smsr-{job_id}-frames.zip")
 
 
 @router.get(
@@ -209,10 +209,9 @@ async def get_array(shared: Shared, job_id: JobId, array: ArrayName) -> Download
     `faces`, where some were sent, (F, 3). A reader that knows the header can fetch single frames.
     """
     files = await _open(shared, job_id)
-    found = files.arrays().get(f"{array}.npy")
-    if found is None:
+    if f"{array}.npy" not in files.arrays():
         raise Problem("unknown-file", "No faces were sent with the job, so its result has none.")
-    return files.array(found, f"smsr-{job_id}-{array}.npy")
+    return files.array(f"{array}.npy", f"smsr-{job_id}-{array}.npy")
 
 
 @router.get(

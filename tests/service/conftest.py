@@ -25,6 +25,7 @@ from smsr.synthetic import Example, make_example
 from tests.conftest import ROOT, RedisProcess, clean_environment, redis_running
 from worker.pool import WorkerPool
 from worker.settings import Settings
+from worker.storage import ObjectStorage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -60,6 +61,10 @@ class Api:
 
     def client(self, **more: Any) -> httpx.Client:
         return httpx.Client(base_url=self.url, timeout=60, **more)
+
+    def storage(self) -> ObjectStorage:
+        """The storage of the process, for what needs no HTTP."""
+        return ObjectStorage(self.settings.objects_url)
 
     def stored(self) -> set[str]:
         """Paths of all files in the storage."""

@@ -4,16 +4,37 @@ import base64
 import hashlib
 import io
 import os
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import httpx
 import numpy as np
 import pytest
 
 from service.downloads import disposition, safe_media_type
-from tests.service.conftest import Api, finished, npy, problem, submit
+from tests.conftest import redis_running
+from tests.service.conftest import (
+    Api,
+    api_running,
+    finished,
+    npy,
+    problem,
+    settings_for,
+    submit,
+    wait_for,
+)
+from worker.checksums import write_checksums
+from worker.records import InputFile, JobRecord, RecordStore, Verdict, new_job_id
 
 if TYPE_CHECKING:
-    import httpx
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
 
     from smsr.synthetic import Example
 
@@ -26,8 +47,9 @@ def job(api: Api, example: Example, tracks: bytes) -> dict[str, Any]:
         return finished(client, submit(client, files))
 
 
-RESUMABLE = ("shapes.npy", "cameras.npy", "translations.npy", "faces.npy", "frames/7.ply")
-FILES = (*RESUMABLE, "report.json", "inputs/measurements", "inputs/faces")
+VIEWS = ("shapes.npy", "cameras.npy", "translations.npy", "faces.npy", "frames/7.ply")
+ARCHIVES = ("result.npz", "frames.zip")
+FILES = (*VIEWS, *ARCHIVES, "report.json", "inputs/measurements", "inputs/faces")
 
 
 def of(job: dict[str, Any], what: str) -> str:
@@ -152,3 +174,150 @@ def test_names_cannot_break_out_of_their_header() -> None:
 @pytest.mark.parametrize("sent", [None, "", "text", "a/b; c=d", "a/b\r\nx: y", "text /html"])
 def test_types_that_are_none(sent: str | None) -> None:
     assert safe_media_type(sent) == "application/octet-stream"
+
+
+@pytest.mark.parametrize("what", [name for name in VIEWS if name.endswith(".npy")])
+def test_an_array_comes_with_its_digest(
+    client: httpx.Client, job: dict[str, Any], what: str
+) -> None:
+    whole = client.get(of(job, what))
+    digest = base64.b64encode(hashlib.sha256(whole.content).digest()).decode()
+    assert whole.headers["repr-digest"] == f"sha-256=:{digest}:"
+    part = client.get(of(job, what), headers={"Range": "bytes=0-9"})
+    assert part.headers["repr-digest"] == whole.headers["repr-digest"]
+
+
+@pytest.mark.parametrize("what", ARCHIVES)
+def test_results_without_checksums_are_sent_whole(api: Api, tracks: bytes, what: str) -> None:
+    """As earlier versions published them."""
+    with api.client() as client:
+        job = finished(client, submit(client, {"measurements": ("w.npy", tracks)}))
+        stored = api.storage()
+        prefix = f"results/{job['id']}/{job['attempt']}/"
+        kept = {item.key: stored.get(item.key) for item in stored.list_prefix(prefix)}
+        stored.delete_prefix(prefix)
+        for key, data in kept.items():
+            if "checksums" not in key:
+                stored.put_bytes(key, data)
+        answer = client.get(of(job, what), headers={"Range": "bytes=0-9"})
+        assert (answer.status_code, answer.headers["accept-ranges"]) == (200, "none")
+        assert len(answer.content) == int(answer.headers["content-length"])
+        with zipfile.ZipFile(io.BytesIO(answer.content)) as opened:
+            assert opened.testzip() is None
+        client.delete(job["links"]["self"])
+
+
+@pytest.fixture(scope="module")
+def long_job(api: Api) -> str:
+    """A finished job of 20,000 frames with many faces: as records and files, without a solver."""
+    generator = np.random.default_rng(0)
+    frames, points = 20_000, 60
+    shapes = generator.normal(size=(frames, points, 3)).astype("<f4")
+    return publish_result(
+        api,
+        {
+            "shapes.npy": shapes,
+            "cameras.npy": np.zeros((frames, 2, 3)),
+            "translations.npy": np.zeros((frames, 2)),
+            "faces.npy": generator.integers(0, points, (80, 3)),
+        },
+    )
+
+
+def publish_result(api: Api, arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Publish arrays as the result of a new job, as a worker does."""
+    records = RecordStore(api.redis.client())
+    storage = api.storage()
+    job_id = new_job_id()
+    inputs = {
+        role: InputFile(f"uploads/{job_id}/{role}", "w.npy", 1, "0" * 64)
+        for role in ("measurements", "faces")
+    }
+    records.create(JobRecord.new(job_id, options={}, inputs=inputs, name="w.npy"))
+    ticket = records.assign_ticket(job_id, "ticket")
+    assert ticket is not None
+    attempt = records.begin_attempt(job_id, worker="test", ticket="ticket", lease=60)
+    assert attempt is not None
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        for name, array in arrays.items():
+            np.save(folder / name, array)
+        (folder / "report.json").write_text("{}")
+        write_checksums(folder, tuple(arrays))
+        for path in folder.iterdir():
+            storage.put_file(f"results/{job_id}/{attempt}/{path.name}", path)
+    frames, points, _ = arrays["shapes.npy"].shape
+    verdict = records.publish(job_id, attempt, frames=frames, points=points, timings={})
+    assert verdict is Verdict.OK
+    return job_id
+
+
+def test_an_archive_of_many_frames_takes_no_more_memory(api: Api, long_job: str) -> None:
+    """34 MB in 20,000 members: whole, and any part without what stands before it."""
+    url = f"/v1/jobs/{long_job}/frames.zip"
+    with api.client() as client:
+        client.get(f"/v1/jobs/{long_job}/frames/0.ply")
+        before = api.resident()
+        answer = client.get(url)
+        assert len(answer.content) == int(answer.headers["content-length"]) > 30_000_000
+        assert api.resident("VmHWM") - before < 48 << 20
+        with zipfile.ZipFile(io.BytesIO(answer.content)) as opened:
+            assert len(opened.namelist()) == 20_000
+            assert opened.testzip() is None
+            assert (
+                opened.read("frame_19999.ply")
+                == client.get(f"/v1/jobs/{long_job}/frames/19999.ply").content
+            )
+        size = len(answer.content)
+        for start in (size - 20, size - 1_000_000, size // 2, 12_345_678):
+            part = client.get(url, headers={"Range": f"bytes={start}-{start + 99_999}"})
+            assert part.status_code == 206
+            assert part.content == answer.content[start : start + 100_000]
+
+
+def test_curl_goes_on_where_it_was_killed_though_the_service_was_restarted(
+    tmp_path: Path,
+) -> None:
+    curl = shutil.which("curl")
+    if curl is None:
+        pytest.skip("curl is not here")
+    wholes: dict[str, httpx.Response] = {}
+    with redis_running(tmp_path) as redis:
+        settings = settings_for(tmp_path, redis)
+        with api_running(settings, redis, tmp_path / "api.log") as api:
+            shapes = np.random.default_rng(0).normal(size=(2000, 400, 3)).astype("<f4")
+            arrays = {
+                "shapes.npy": shapes,
+                "cameras.npy": np.zeros((2000, 2, 3)),
+                "translations.npy": np.zeros((2000, 2)),
+                "faces.npy": np.zeros((5, 3), np.int64),
+            }
+            job = f"/v1/jobs/{publish_result(api, arrays)}"
+            for what in ARCHIVES:
+                target = tmp_path / what
+                wholes[what] = httpx.get(f"{api.url}{job}/{what}")
+                limited = [curl, "-sS", "--limit-rate", "4M", "-o", str(target)]
+                with subprocess.Popen([*limited, f"{api.url}{job}/{what}"]) as process:
+                    wait_for(partial(has_bytes, target, 1_000_000))
+                    process.kill()
+                held = target.read_bytes()
+                assert len(held) < len(wholes[what].content)
+                assert wholes[what].content.startswith(held)
+        with api_running(settings, redis, tmp_path / "api.log") as api:
+            for what, whole in wholes.items():
+                target = tmp_path / what
+                held_size = target.stat().st_size
+                url = f"{api.url}{job}/{what}"
+                resume = [curl, "-sS", "-f", "-C", "-", "-D", "-", "-o", str(target), url]
+                done = subprocess.run(resume, capture_output=True, text=True, check=True)
+                assert "206 Partial Content" in done.stdout
+                assert f"content-range: bytes {held_size}-" in done.stdout.lower()
+                assert httpx.head(url).headers["etag"] == whole.headers["etag"]
+                assert target.read_bytes() == whole.content
+                unzip = shutil.which("unzip")
+                if unzip is not None:
+                    subprocess.run([unzip, "-tqq", target], check=True)
+
+
+def has_bytes(path: Path, least: int) -> bool:
+    return path.exists() and path.stat().st_size > least

@@ -28,6 +28,7 @@ from tests.worker.conftest import (
 )
 from tests.worker.workers import Behaviour
 from worker.changes import ChangeFeed
+from worker.checksums import CHECKSUMS, FRAME_CHECKSUMS
 from worker.connections import connect, connect_async
 from worker.queue import JobQueue
 from worker.records import result_prefix
@@ -66,6 +67,7 @@ def check_success(queue: JobQueue, record: JobRecord, example: Example) -> None:
 
 def expected_objects(record: JobRecord) -> set[str]:
     names = {"shapes.npy", "cameras.npy", "translations.npy", "report.json"}
+    names |= {CHECKSUMS, FRAME_CHECKSUMS}
     return names | ({"faces.npy"} if "faces" in record.inputs else set())
 
 
