@@ -11,15 +11,18 @@ from anyio import to_thread
 from fastapi import APIRouter
 from fastapi.routing import APIRoute
 from fastapi_offline import FastAPIOffline
+from starlette.middleware.cors import CORSMiddleware
 
 import smsr
-from service import problems
+from service import documentation, problems
+from service.access import KEY_SCHEMES, Access, Gate, policy_for
 from service.context import Context
 from service.downloads import OpenResults
 from service.lingering import LingeringClose
 from service.metrics import MeasuredRequests, Metrics
 from service.routes import events, health, info, jobs, metrics, results, uploads
 from service.routes import problems as problem_pages
+from service.security import SecurityHeaders
 from worker.changes import ChangeFeed
 from worker.connections import connect_async
 from worker.maintenance import Maintenance
@@ -31,9 +34,50 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from fastapi import FastAPI
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
-
 _log = logging.getLogger(__name__)
+
+CORS_REQUEST_HEADERS = (
+    "Authorization",
+    "Content-Digest",
+    "Content-Type",
+    "Idempotency-Key",
+    "If-Match",
+    "If-None-Match",
+    "If-Range",
+    "Last-Event-ID",
+    "Prefer",
+    "Range",
+    "Tus-Resumable",
+    "Upload-Checksum",
+    "Upload-Concat",
+    "Upload-Defer-Length",
+    "Upload-Length",
+    "Upload-Metadata",
+    "Upload-Offset",
+    "X-API-Key",
+)
+CORS_ANSWER_HEADERS = (
+    "Accept-Ranges",
+    "Content-Disposition",
+    "Content-Range",
+    "ETag",
+    "Link",
+    "Location",
+    "Preference-Applied",
+    "RateLimit",
+    "RateLimit-Policy",
+    "Retry-After",
+    "Tus-Checksum-Algorithm",
+    "Tus-Extension",
+    "Tus-Max-Size",
+    "Tus-Resumable",
+    "Tus-Version",
+    "Upload-Expires",
+    "Upload-Length",
+    "Upload-Metadata",
+    "Upload-Offset",
+)
+"""What pages of other origins may send and read, where they may at all."""
 
 _DESCRIPTION = """
 Send the 2D point tracks of a deforming object, filmed by one camera; get back the moving 3D
@@ -47,7 +91,7 @@ Every error is a problem document (RFC 9457) with a stable `type`; `/problems` d
 """
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
     """Return the application; it connects when its lifespan begins.
 
     Redis need not answer by then: until it does, requests get 503 and /readyz says why. No workers
@@ -57,6 +101,9 @@ def create_app(settings: Settings) -> FastAPI:
     ----------
     settings : Settings
         `redis_url` must be set.
+    address : str, optional
+        IP address at which the application will be reached. Unless it is given and is a loopback
+        address, `access` 'auto' means that API keys are needed.
 
     Raises
     ------
@@ -67,6 +114,7 @@ def create_app(settings: Settings) -> FastAPI:
         raise ValueError("the service needs the address of a Redis server")
     redis_url = settings.redis_url
     measured = Metrics(settings)
+    policy = policy_for(settings, address)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -74,6 +122,7 @@ def create_app(settings: Settings) -> FastAPI:
         async with connect_async(redis_url) as redis, ChangeFeed(redis) as feed:
             opened = OpenResults(queue.storage)
             uploaded = UploadStore(queue.redis, ttl=settings.upload_ttl_seconds)
+            app.state.gate = Gate(settings, policy, redis)
             app.state.context = Context(
                 settings, queue, feed, opened, measured, uploaded, Digests()
             )
@@ -88,6 +137,7 @@ def create_app(settings: Settings) -> FastAPI:
                 measured.close()
 
     app = FastAPIOffline(
+        docs_url=None,
         redoc_url=None,
         title="SMSR",
         summary="Moving 3D surfaces from 2D point tracks of one camera.",
@@ -104,11 +154,23 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.router.redirect_slashes = False
     problems.install(app)
+    documentation.install(app)
     for routes in (jobs, events, results, uploads, info, health, metrics, problem_pages):
-        app.include_router(routes.router)
+        closed = routes.router.prefix.startswith("/v1") and routes is not info
+        app.include_router(routes.router, dependencies=KEY_SCHEMES if closed else None)
         app.include_router(_heads_of(routes.router))
+    app.add_middleware(Access)
     app.add_middleware(uploads.TusHeaders)
-    app.add_middleware(NoSniff)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=[origin.strip() for origin in settings.cors_origins.split(",")],
+            allow_methods=["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"],
+            allow_headers=CORS_REQUEST_HEADERS,
+            expose_headers=CORS_ANSWER_HEADERS,
+            max_age=3600,
+        )
+    app.add_middleware(SecurityHeaders)
     app.add_middleware(
         MeasuredRequests,
         metrics=measured.requests,
@@ -133,6 +195,7 @@ def app_from_environment() -> FastAPI:
     """Return the application with the settings of the environment.
 
     For servers that take a factory, as in ``uvicorn --factory service.app:app_from_environment``.
+    Such a server does not say where it listens, so API keys are needed unless ``SMSR_ACCESS=open``.
     """
     return create_app(Settings())
 
@@ -146,22 +209,3 @@ async def _keep_order(queue: JobQueue) -> None:
         except Exception:  # noqa: BLE001  (a bug there must not end the service's care for jobs)
             _log.exception("maintenance failed")
         await asyncio.sleep(queue.settings.maintenance_interval_seconds)
-
-
-class NoSniff:
-    """Adds ``X-Content-Type-Options: nosniff``: an answer is what its type says, not a guess."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on."""
-
-        async def send_marked(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                name = b"x-content-type-options"
-                if all(key != name for key, _ in message["headers"]):
-                    message["headers"] = [*message["headers"], (name, b"nosniff")]
-            await send(message)
-
-        await self.app(scope, receive, send_marked if scope["type"] == "http" else send)

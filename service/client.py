@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import time
 from collections.abc import Callable
 from http import HTTPStatus
@@ -25,7 +26,6 @@ import httpx
 from service.schemas import Info, Job, JobList
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Iterator, Mapping
     from types import TracebackType
 
@@ -135,13 +135,21 @@ class Client:
     patience : float
         Seconds for which a request that fails in the network, or that a busy server puts off, is
         tried again. 0 never tries twice.
+    api_key : str, optional
+        Where the service needs one; by default that of the environment, SMSR_API_KEY.
     transport : httpx.BaseTransport, optional
         Another way to the server than the network.
     """
 
     def __init__(
-        self, server: str, *, patience: float = 60.0, transport: httpx.BaseTransport | None = None
+        self,
+        server: str,
+        *,
+        patience: float = 60.0,
+        api_key: str | None = None,
+        transport: httpx.BaseTransport | None = None,
     ) -> None:
+        key = os.environ.get("SMSR_API_KEY", "") if api_key is None else api_key
         self.server = server.rstrip("/")
         self._patience = patience
         self._http = httpx.Client(
@@ -150,7 +158,8 @@ class Client:
             # A proxy of the environment cannot reach this machine's loopback interface.
             mounts=dict.fromkeys(("all://127.0.0.1", "all://localhost", "all://[::1]")),
             timeout=httpx.Timeout(10.0, read=120.0, write=120.0),
-            headers={"Accept": "application/json, application/problem+json"},
+            headers={"Accept": "application/json, application/problem+json"}
+            | ({"Authorization": f"Bearer {key.strip()}"} if key else {}),
         )
 
     def __enter__(self) -> Self:

@@ -10,7 +10,7 @@ from service.metrics import Metrics
 from service.problems import Problem
 from worker.changes import ChangeFeed
 from worker.queue import JobQueue
-from worker.records import JobRecord
+from worker.records import ANY, Allowance, JobRecord
 from worker.settings import Settings
 from worker.storage import ObjectStorage
 from worker.uploads import Digests, UploadStore
@@ -35,6 +35,8 @@ class Context:
         Of the uploads that this process receives.
     owner : str or None
         Whose jobs this request may see and make; None where all clients share all of them.
+    allowance : Allowance
+        What the owner may have.
     """
 
     settings: Settings
@@ -45,6 +47,7 @@ class Context:
     uploads: UploadStore
     digests: Digests
     owner: str | None = None
+    allowance: Allowance = ANY
 
     @property
     def storage(self) -> ObjectStorage:
@@ -72,7 +75,7 @@ def unknown_job(job_id: str) -> Problem:
 
 def _context(request: Request) -> Context:
     context: Context = request.app.state.context
-    return replace(context, owner=getattr(request.state, "owner", None))
+    return replace(context, owner=request.state.owner, allowance=request.state.allowance)
 
 
 def _job_id(

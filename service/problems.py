@@ -14,13 +14,16 @@ from typing import TYPE_CHECKING, Any, cast
 
 import redis.exceptions
 from fastapi.exceptions import RequestValidationError
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.routing import compile_path
 
+from service.security import protect
 from smsr import errors
 from worker import problems as worker_problems
 from worker.problems import InternalError, StorageUnavailable
+from worker.records import TooManyBytes, TooManyJobs
 from worker.storage import ObjectMissing, StorageError, StorageFull
 
 if TYPE_CHECKING:
@@ -35,6 +38,10 @@ SCHEMA = {"$ref": "#/components/schemas/ProblemDocument"}
 """Of a problem document, in the OpenAPI document."""
 RETRY_SECONDS = 5
 """What ``Retry-After`` says when Redis or the storage is away."""
+JOBS_RETRY_SECONDS = 5
+"""What it says while an owner has too many jobs, which end one by one."""
+BYTES_RETRY_SECONDS = 600
+"""What it says when an owner's storage is full, which someone has to see to."""
 
 _log = logging.getLogger(__name__)
 
@@ -120,6 +127,37 @@ _OF_THE_SERVICE = (
         422,
         "A query parameter or a part of the path has the wrong type or is out of its range.",
         "The member `errors` says for each parameter where it stands and what is wrong.",
+    ),
+    ProblemType(
+        "unauthorized",
+        "An API key is needed",
+        401,
+        "The request gives no API key, or one that does not exist (any more).",
+        "Send `Authorization: Bearer smsr_...` or `X-API-Key: smsr_...`. The operator makes keys "
+        "with `smsr keys create`.",
+    ),
+    ProblemType(
+        "too-many-requests",
+        "Too many requests",
+        429,
+        "The API key was used more often within a minute than it may; `limit` says how often.",
+        "Wait the seconds in Retry-After. The header RateLimit says how many requests are left; "
+        "`Prefer: wait=30` saves most polls.",
+    ),
+    ProblemType(
+        "too-many-jobs",
+        "Too many jobs at a time",
+        429,
+        "The owner of the API key has as many queued and running jobs as it may.",
+        "Submit again when some have ended; Retry-After says when to try.",
+    ),
+    ProblemType(
+        "too-many-bytes",
+        "The storage of this owner is full",
+        507,
+        "Inputs, results and uploads under way of the owner of the API key together would be more "
+        "bytes than it may store.",
+        "Delete jobs that are no longer needed, or ask the operator for more.",
     ),
     ProblemType(
         "unknown-job",
@@ -536,14 +574,19 @@ def respond(
 ) -> ProblemResponse:
     """Answer a request with a problem document."""
     body = document(kind, detail, request.url.path, context or {})
-    # Outside of all middleware for a 500, so it sets this header itself.
-    fixed = {"X-Content-Type-Options": "nosniff"}
-    return ProblemResponse(body, status_code=kind.status, headers=fixed | dict(headers or {}))
+    answer = ProblemResponse(body, status_code=kind.status, headers=dict(headers or {}))
+    # A 500 is answered outside of all middleware, so it gets these headers here.
+    protect(MutableHeaders(raw=answer.raw_headers), request.url.path)
+    return answer
+
+
+def answer(request: Request, problem: Problem) -> ProblemResponse:
+    """Answer a request with a refusal."""
+    return respond(request, problem.type, problem.detail, problem.context, problem.headers)
 
 
 async def _on_problem(request: Request, error: Exception) -> ProblemResponse:
-    found = cast("Problem", error)
-    return respond(request, found.type, found.detail, found.context, found.headers)
+    return answer(request, cast("Problem", error))
 
 
 async def _on_solver_error(request: Request, error: Exception) -> ProblemResponse:
@@ -593,13 +636,41 @@ def _methods_of(request: Request) -> list[str]:
     return sorted(methods | ({"HEAD"} if "GET" in methods else set()))
 
 
-async def _on_redis_away(request: Request, error: Exception) -> ProblemResponse:
+def redis_away(request: Request, error: Exception) -> ProblemResponse:
+    """Answer a request that cannot be served without Redis."""
     _log.warning("Redis does not answer: %s", error)
     return respond(
         request,
         CATALOGUE["queue-unavailable"],
         "The job queue does not answer at the moment. Please try again.",
         headers={"Retry-After": str(RETRY_SECONDS)},
+    )
+
+
+async def _on_redis_away(request: Request, error: Exception) -> ProblemResponse:
+    return redis_away(request, error)
+
+
+async def _on_too_many_jobs(request: Request, _error: Exception) -> ProblemResponse:
+    most = request.state.allowance.jobs
+    return respond(
+        request,
+        CATALOGUE["too-many-jobs"],
+        f"{most} jobs of this owner are queued or running, which is as many as may be.",
+        {"limit": most},
+        headers={"Retry-After": str(JOBS_RETRY_SECONDS)},
+    )
+
+
+async def _on_too_many_bytes(request: Request, _error: Exception) -> ProblemResponse:
+    most = request.state.allowance.bytes
+    return respond(
+        request,
+        CATALOGUE["too-many-bytes"],
+        f"This would be more than the {most} bytes that may be stored. Jobs that are deleted or "
+        "expire make room.",
+        {"limit": most},
+        headers={"Retry-After": str(BYTES_RETRY_SECONDS)},
     )
 
 
@@ -650,6 +721,8 @@ def install(app: FastAPI) -> None:
         redis.exceptions.OutOfMemoryError,
     ):
         app.add_exception_handler(away, _on_redis_away)
+    app.add_exception_handler(TooManyJobs, _on_too_many_jobs)
+    app.add_exception_handler(TooManyBytes, _on_too_many_bytes)
     app.add_exception_handler(StorageError, _on_storage_away)
     app.add_exception_handler(StorageFull, _on_storage_full)
     app.add_exception_handler(ObjectMissing, _on_object_missing)

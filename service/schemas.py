@@ -299,7 +299,9 @@ class Readiness(BaseModel):
     status: Literal["ready"] = "ready"
     checks: dict[str, str] = Field(examples=[{"redis": "ok", "storage": "ok"}])
     workers: int = Field(description="Live worker processes; with none, jobs wait.")
-    queued: int = Field(description="Jobs that wait for a worker.")
+    queued: int | None = Field(
+        description="Jobs that wait for a worker; not told where API keys are needed."
+    )
 
 
 class ProblemTypeDocument(BaseModel):

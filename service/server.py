@@ -49,7 +49,7 @@ def run_server(settings: Settings, listener: socket.socket, ready: Callable[[], 
         False where the service could not start; the log says why.
     """
     config = uvicorn.Config(
-        create_app(settings),
+        create_app(settings, address=listener.getsockname()[0]),
         log_config=None,
         access_log=False,
         server_header=False,

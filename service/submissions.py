@@ -24,12 +24,12 @@ from redis.exceptions import RedisError
 
 import smsr
 from service.problems import Problem
-from worker.records import JobRecord, Priority, upload_prefix
+from worker.records import JobRecord, Priority, TooManyBytes, TooManyJobs, upload_prefix
 from worker.settings import Settings
 from worker.storage import StorageError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from pydantic import ValidationInfo
 
@@ -197,10 +197,25 @@ def _hash(document: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-async def accept(shared: Context, job_id: str, submission: Submission) -> JobRecord:
+async def accept(
+    shared: Context, job_id: str, submission: Submission, uploads: Sequence[str] = ()
+) -> JobRecord:
     """Make a submission a job of this request's owner; Redis may go away at any moment.
 
     Where there is no job in the end, the files are removed.
+
+    Parameters
+    ----------
+    shared : Context
+    job_id : str
+    submission : Submission
+    uploads : sequence of str
+        Ids of the finished uploads whose files the job has taken (`service.quotas.hold`).
+
+    Raises
+    ------
+    TooManyJobs, TooManyBytes
+        The owner may not have another one.
     """
     settings = submission.settings
     record = JobRecord.new(
@@ -218,7 +233,12 @@ async def accept(shared: Context, job_id: str, submission: Submission) -> JobRec
     )
     reuse = shared.settings.reuse_results if settings.reuse is None else settings.reuse
     try:
-        return await to_thread.run_sync(partial(shared.queue.submit, record, reuse=reuse))
+        return await to_thread.run_sync(
+            partial(shared.queue.submit, record, shared.allowance, uploads, reuse=reuse)
+        )
+    except (TooManyJobs, TooManyBytes):
+        await discard_uploads(shared.storage, record.id)
+        raise
     except RedisError:
         # A record without a place in the queue gets one by maintenance: it is accepted. Where not
         # even that can be seen now, the files stay until maintenance knows whether there is one.

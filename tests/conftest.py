@@ -21,7 +21,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 ROOT = Path(__file__).resolve().parent.parent
-_OF_A_CLUSTER = ("REDIS_URL", "SMSR_REDIS_URL", "SMSR_STORAGE_URL", "SMSR_DATA_DIR", "SMSR_SERVER")
+_OF_A_CLUSTER = (
+    "REDIS_URL",
+    "SMSR_ACCESS",
+    "SMSR_API_KEY",
+    "SMSR_DATA_DIR",
+    "SMSR_REDIS_URL",
+    "SMSR_SERVER",
+    "SMSR_STORAGE_URL",
+)
 
 
 def clean_environment(**more: str) -> dict[str, str]:

@@ -21,6 +21,7 @@ from worker.connections import connect
 from worker.processes import KeptProcess
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from types import TracebackType
     from typing import Self
 
@@ -236,6 +237,40 @@ class EmbeddedRedis:
         return "the Redis server does not start: " + (
             " | ".join(lines[-5:]) or "no log was written"
         )
+
+
+@contextlib.contextmanager
+def redis_of_folder(folder: Path) -> Iterator[str]:
+    """Give the address of the server of a folder: the one that runs, else one for this while.
+
+    Raises
+    ------
+    ServerFailed
+        There is none that answers, and none can be started.
+    """
+    server = EmbeddedRedis(folder)
+    try:
+        server.start()
+    except DataFolderInUse:
+        yield _address_of_running(server)
+        return
+    try:
+        yield server.url
+    finally:
+        server.stop()
+
+
+def _address_of_running(server: EmbeddedRedis) -> str:
+    """Return the address of a server that another process has started, or is about to."""
+    deadline = time.monotonic() + _START_SECONDS
+    while time.monotonic() < deadline:
+        with contextlib.suppress(FileNotFoundError, RedisError):
+            address = server._address_file.read_text(encoding="utf-8")
+            with contextlib.closing(connect(address)) as client:
+                client.ping()
+            return address
+        time.sleep(0.05)
+    raise ServerFailed(f"the Redis server of {server.folder} does not answer")
 
 
 def find_server() -> str:

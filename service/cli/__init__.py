@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import smsr
-from service.cli import benchmark, demo, local, remote, results, serve
+from service.cli import benchmark, demo, keys, local, remote, results, serve
 from service.cli.exits import EXPECTED, HELP, console, leave
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ app.command()(local.options)
 app.command()(local.example)
 app.command()(remote.submit)
 app.add_typer(remote.jobs, name="jobs")
+app.add_typer(keys.keys, name="keys")
 app.command()(serve.serve)
 app.command()(serve.worker)
 app.command()(demo.demo)

@@ -25,7 +25,14 @@ if TYPE_CHECKING:
     from service.schemas import Job
 
 _STOP_SECONDS = 60
-_NOT_INHERITED = ("REDIS_URL", "SMSR_REDIS_URL", "SMSR_STORAGE_URL", "SMSR_DATA_DIR")
+_NOT_INHERITED = (
+    "SMSR_ACCESS",
+    "SMSR_API_KEY",
+    "REDIS_URL",
+    "SMSR_REDIS_URL",
+    "SMSR_STORAGE_URL",
+    "SMSR_DATA_DIR",
+)
 
 
 def demo(

@@ -38,6 +38,15 @@ if TYPE_CHECKING:
 Server = Annotated[
     str, typer.Option(envvar="SMSR_SERVER", metavar="URL", help="Address of the server.")
 ]
+ApiKey = Annotated[
+    str | None,
+    typer.Option(
+        envvar="SMSR_API_KEY",
+        metavar="KEY",
+        show_default=False,
+        help="API key, where the server needs one; the environment keeps it from other users.",
+    ),
+]
 LOCAL_SERVER = "http://127.0.0.1:8000"
 OfStatus = Annotated[JobStatus | None, typer.Option(help="Only jobs of this status.")]
 JobId = Annotated[str, typer.Argument(metavar="ID", show_default=False)]
@@ -92,6 +101,7 @@ def submit(
         ),
     ],
     server: Server = LOCAL_SERVER,
+    api_key: ApiKey = None,
     wait: Annotated[
         bool, typer.Option(help="Wait for the jobs and tell how they ended; -o implies it.")
     ] = False,
@@ -124,7 +134,7 @@ def submit(
     values = preset_and_options(JobOptions, preset, option)
     parse(JobOptions, values)
     order = _Order(ground_truth, faces, values, wait or out is not None, out, ply)
-    with Client(server, patience=patience) as client, progress_bars() as bars:
+    with Client(server, patience=patience, api_key=api_key) as client, progress_bars() as bars:
         outcomes = _all(client, order, files, bars, parallel)
     if as_json:
         console.print_json(
@@ -290,13 +300,14 @@ jobs = typer.Typer(no_args_is_help=True, help="Look after the jobs of a server."
 @jobs.command("list")
 def list_jobs(
     server: Server = LOCAL_SERVER,
+    api_key: ApiKey = None,
     status: OfStatus = None,
     limit: Annotated[int, typer.Option(min=1, help="How many at most.")] = 50,
     patience: Patience = 5.0,
     as_json: AsJson = False,
 ) -> None:
     """List jobs, newest first."""
-    with Client(server, patience=patience) as client:
+    with Client(server, patience=patience, api_key=api_key) as client:
         found = [job for job, _ in zip(client.list(status=status), range(limit), strict=False)]
     if as_json:
         console.print_json(data=[job.model_dump(mode="json") for job in found])
@@ -311,25 +322,31 @@ def list_jobs(
 
 
 @jobs.command()
-def show(job_id: JobId, server: Server = LOCAL_SERVER, patience: Patience = 5.0) -> None:
+def show(
+    job_id: JobId, server: Server = LOCAL_SERVER, api_key: ApiKey = None, patience: Patience = 5.0
+) -> None:
     """Print everything about a job, as JSON."""
-    with Client(server, patience=patience) as client:
+    with Client(server, patience=patience, api_key=api_key) as client:
         console.print_json(client.get(job_id).model_dump_json())
 
 
 @jobs.command()
-def cancel(job_id: JobId, server: Server = LOCAL_SERVER, patience: Patience = 5.0) -> None:
+def cancel(
+    job_id: JobId, server: Server = LOCAL_SERVER, api_key: ApiKey = None, patience: Patience = 5.0
+) -> None:
     """Cancel a queued or running job."""
-    with Client(server, patience=patience) as client:
+    with Client(server, patience=patience, api_key=api_key) as client:
         job = client.cancel(job_id)
     state = job.status if job.status in FINAL else "stopping"
     console.print(f"{job.id} {state}")
 
 
 @jobs.command()
-def retry(job_id: JobId, server: Server = LOCAL_SERVER, patience: Patience = 5.0) -> None:
+def retry(
+    job_id: JobId, server: Server = LOCAL_SERVER, api_key: ApiKey = None, patience: Patience = 5.0
+) -> None:
     """Queue a finished job again."""
-    with Client(server, patience=patience) as client:
+    with Client(server, patience=patience, api_key=api_key) as client:
         console.print(f"{client.retry(job_id).id} queued")
 
 
@@ -337,10 +354,11 @@ def retry(job_id: JobId, server: Server = LOCAL_SERVER, patience: Patience = 5.0
 def delete(
     job_ids: Annotated[list[str], typer.Argument(metavar="ID...", show_default=False)],
     server: Server = LOCAL_SERVER,
+    api_key: ApiKey = None,
     patience: Patience = 5.0,
 ) -> None:
     """Remove jobs with their files."""
-    with Client(server, patience=patience) as client:
+    with Client(server, patience=patience, api_key=api_key) as client:
         for job_id in job_ids:
             client.delete(job_id)
             console.print(f"{job_id} deleted")
@@ -355,10 +373,11 @@ def download(
     ] = None,
     ply: Annotated[bool, typer.Option(help="Download a PLY of every frame too.")] = True,
     server: Server = LOCAL_SERVER,
+    api_key: ApiKey = None,
     patience: Patience = 5.0,
 ) -> None:
     """Wait for a job and download its result."""
-    with Client(server, patience=patience) as client:
+    with Client(server, patience=patience, api_key=api_key) as client:
         job = client.wait(job_id)
         require_success(job)
         target = out or Path(job.id)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.exits import ExitCode, complain, console
+from service.cli.exits import ExitCode, complain, console, errors
 from worker.logs import configure_logging
 from worker.settings import Settings
 
@@ -66,10 +66,43 @@ def serve(
         if workers != 0:
             stack.enter_context(WorkerPool(settings))
         url = _url(host, listener)
-        if not run_server(
-            settings, listener, lambda: console.print(f"SMSR serves {url}", soft_wrap=True)
-        ):
+
+        def ready() -> None:
+            console.print(f"SMSR serves {url}", soft_wrap=True)
+            _tell_who_may_come(settings, listener)
+
+        if not run_server(settings, listener, ready):
             raise typer.Exit(ExitCode.FAILED)
+
+
+def _tell_who_may_come(settings: Settings, listener: socket.socket) -> None:
+    """Say on standard error what an operator may not expect."""
+    from redis.exceptions import RedisError
+
+    from service.access import policy_for
+    from worker.connections import connect
+    from worker.keys import KeyStore
+
+    address = listener.getsockname()[0]
+    match policy_for(settings, address):
+        case "keys":
+            with contextlib.closing(connect(str(settings.redis_url))) as redis:
+                try:
+                    known = KeyStore(redis).list()
+                except RedisError:
+                    return
+            if known:
+                return
+            errors.print(
+                "API keys are needed, and there is none yet; make one with: smsr keys create OWNER "
+                "(with the same SMSR_DATA_DIR or REDIS_URL; or set SMSR_ACCESS=open for a service "
+                "that everyone who reaches it may use)",
+                soft_wrap=True,
+            )
+        case "open" if (
+            policy_for(settings.model_copy(update={"access": "auto"}), address) == "keys"
+        ):
+            errors.print(f"Everyone who reaches {address} may use the service.", soft_wrap=True)
 
 
 def worker() -> None:

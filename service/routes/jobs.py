@@ -8,6 +8,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
+from service import quotas
 from service.context import Context, JobId, Shared, root_of, unknown_job
 from service.downloads import diagnostics_of
 from service.incoming import is_json, limits_of, receive_references
@@ -143,6 +144,9 @@ _BODY: dict[str, Any] = {
             "not-numeric",
             "empty-file",
             "unreadable-file",
+            "too-many-requests",
+            "too-many-jobs",
+            "too-many-bytes",
             "queue-unavailable",
             "storage-unavailable",
             "storage-full",
@@ -163,17 +167,19 @@ async def submit(request: Request, response: Response, shared: Shared) -> Job:
     """
     queue = shared.queue
     await to_thread.run_sync(queue.redis.ping)  # before a long upload, not after it
+    await quotas.check_jobs(shared)
     job_id = new_job_id()
-    try:
-        if is_json(request.headers):
-            submission = await receive_references(request, job_id, shared)
-        else:
-            submission = await receive_submission(
-                request, job_id, shared.storage, limits_of(shared), shared.settings
-            )
-    except ClientDisconnect:
-        raise Problem("malformed-multipart", "The client went away.") from None
-    record = await accept(shared, job_id, submission)
+    async with quotas.room(shared, request, job_id) as body:
+        try:
+            if is_json(body.headers):
+                submission = await receive_references(body, job_id, shared)
+            else:
+                submission = await receive_submission(
+                    body, job_id, shared.storage, limits_of(shared), shared.settings
+                )
+        except ClientDisconnect:
+            raise Problem("malformed-multipart", "The client went away.") from None
+        record = await accept(shared, job_id, submission)
     document = job_document(record, root=root_of(request))
     response.headers["Location"] = document.links.self
     return document
@@ -334,14 +340,19 @@ async def cancel_job(request: Request, response: Response, shared: Shared, job_i
     status_code=202,
     summary="Run a finished job again",
     responses=example_responses(
-        "unknown-job", "job-unfinished", "inputs-gone", "queue-unavailable"
+        "unknown-job",
+        "job-unfinished",
+        "inputs-gone",
+        "too-many-requests",
+        "too-many-jobs",
+        "queue-unavailable",
     ),
 )
 async def retry_job(request: Request, shared: Shared, job_id: JobId) -> Job:
     """Queue a job that has ended once more, with the same files and options; its result goes."""
     await shared.record(job_id)
     try:
-        record = await to_thread.run_sync(shared.queue.retry, job_id)
+        record = await to_thread.run_sync(shared.queue.retry, job_id, shared.allowance)
     except JobActive:
         raise Problem("job-unfinished", "The job is still queued or running.") from None
     except InputsGone:

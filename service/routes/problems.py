@@ -8,6 +8,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from service.context import root_of
 from service.problems import CATALOGUE, Problem, ProblemType, example_responses
 from service.schemas import ProblemTypeDocument
+from service.security import policy_of_document
 
 router = APIRouter(prefix="/problems", tags=["service"])
 
@@ -18,6 +19,13 @@ _PAGE = """<!doctype html>
 color-scheme:light dark}}dt{{font-weight:600;margin-top:1rem}}dd{{margin:0}}</style></head>
 <body>{body}</body></html>
 """
+
+
+def _page(title: str, body: str) -> HTMLResponse:
+    """Return a page whose only inline parts, by its policy, are those of the template."""
+    policy = policy_of_document(_PAGE.format(title="", body=""))
+    text = _PAGE.format(title=title, body=body)
+    return HTMLResponse(text, headers={"Content-Security-Policy": policy, "Vary": "Accept"})
 
 
 def _document(kind: ProblemType, root: str) -> ProblemTypeDocument:
@@ -48,7 +56,7 @@ async def all_problems(request: Request) -> Response:
         f"<dd>{escape(kind.title)}</dd>"
         for kind in kinds
     )
-    return HTMLResponse(_PAGE.format(title="Problems", body=f"<h1>Problems</h1><dl>{entries}</dl>"))
+    return _page("Problems", f"<h1>Problems</h1><dl>{entries}</dl>")
 
 
 @router.get(
@@ -74,4 +82,4 @@ async def one_problem(request: Request, slug: str) -> Response:
         f"<dt>Remedy</dt><dd>{escape(kind.remedy)}</dd></dl>"
         f'<p><a href="{escape(root)}/problems">All problems</a></p>'
     )
-    return HTMLResponse(_PAGE.format(title=escape(kind.title), body=body))
+    return _page(escape(kind.title), body)

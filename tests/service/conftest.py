@@ -137,6 +137,7 @@ def settings_for(folder: Path, redis: RedisProcess, **more: Any) -> Settings:
         "max_upload_bytes": UPLOAD_LIMIT,
         "max_array_bytes": ARRAY_LIMIT,
         "threads": 1,
+        "access": "open",
         "progress_interval_seconds": 0.05,
         "reuse_results": False,
     }
