@@ -1,0 +1,410 @@
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import httpx
+import numpy as np
+import pytest
+from fastapi.routing import iter_route_contexts
+from starlette.routing import Mount
+
+from service.access import PUBLIC, policy_for
+from service.app import create_app
+from tests.conftest import redis_running
+from tests.service.conftest import Api, api_running, npy, problem, settings_for, submit
+from worker.keys import KeyStore
+from worker.settings import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """An API that needs keys, without workers."""
+
+    api: Api
+
+    @property
+    def keys(self) -> KeyStore:
+        return KeyStore(self.api.redis.client())
+
+    def client(self, owner: str, **limits: Any) -> httpx.Client:
+        """A client with a new key."""
+        _, key = self.keys.create(owner, **limits)
+        return self.api.client(headers={"Authorization": f"Bearer {key}"})
+
+
+@pytest.fixture(scope="module")
+def guarded_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    folder = tmp_path_factory.mktemp("guarded")
+    with redis_running(folder) as redis:
+        settings = settings_for(
+            folder,
+            redis,
+            access="keys",
+            metrics_token="a-token-for-metrics",
+            cors_origins="https://app.example.org, https://b.example.org",
+        )
+        with api_running(settings, redis, folder / "api.log") as api:
+            yield api
+
+
+@pytest.fixture
+def guarded(guarded_server: Api) -> Guarded:
+    guarded_server.redis.client().flushall()
+    for folder in ("uploads", "results"):
+        shutil.rmtree(guarded_server.objects / folder, ignore_errors=True)
+    return Guarded(guarded_server)
+
+
+@pytest.fixture
+def files() -> dict[str, tuple[str, bytes]]:
+    return {"measurements": ("t.npy", npy(np.random.default_rng(0).normal(size=(12, 9))))}
+
+
+@pytest.fixture
+def anyone(guarded: Guarded) -> Iterator[httpx.Client]:
+    with guarded.api.client() as client:
+        yield client
+
+
+def test_without_a_key_nothing_is_told(anyone: httpx.Client) -> None:
+    for path in ("/v1/jobs", "/v1/jobs/" + "0" * 32, "/v1/nothing", "/v1"):
+        document = problem(answer := anyone.get(path), "unauthorized", 401)
+        assert answer.headers["www-authenticate"] == 'Bearer realm="smsr"'
+        assert "smsr_" in document["detail"]
+    answer = anyone.post("/v1/jobs", content=b"x" * 1_000_000)
+    problem(answer, "unauthorized", 401)
+
+
+def test_a_key_is_given_in_either_header(guarded: Guarded, anyone: httpx.Client) -> None:
+    _, key = guarded.keys.create("ann")
+    for headers in (
+        {"Authorization": f"Bearer {key}"},
+        {"Authorization": f"bearer {key}"},
+        {"X-API-Key": key},
+    ):
+        assert anyone.get("/v1/jobs", headers=headers).json() == {"jobs": [], "next": None}
+    for headers in (
+        {"Authorization": f"Basic {key}"},
+        {"Authorization": f"Bearer {key[:-1]}"},
+        {"Authorization": "Bearer x"},
+        {"X-API-Key": "é".encode()},
+    ):
+        problem(anyone.get("/v1/jobs", headers=headers), "unauthorized", 401)
+    answer = anyone.get(f"/v1/jobs?api_key={key}")
+    problem(answer, "unauthorized", 401)
+
+
+def test_a_revoked_key_is_refused_at_once(guarded: Guarded) -> None:
+    made, key = guarded.keys.create("ann")
+    with guarded.api.client(headers={"X-API-Key": key}) as client:
+        assert client.get("/v1/jobs").status_code == 200
+        guarded.keys.revoke(made.id)
+        answer = client.get("/v1/jobs")
+        problem(answer, "unauthorized", 401)
+        assert answer.headers["www-authenticate"] == 'Bearer realm="smsr", error="invalid_token"'
+
+
+def test_all_keys_of_an_owner_see_its_jobs(
+    guarded: Guarded, files: dict[str, tuple[str, bytes]]
+) -> None:
+    with guarded.client("ann") as one, guarded.client("ann") as two, guarded.client("bob") as other:
+        job = submit(one, files).json()
+        assert two.get(f"/v1/jobs/{job['id']}").json()["id"] == job["id"]
+        assert [j["id"] for j in two.get("/v1/jobs").json()["jobs"]] == [job["id"]]
+        assert other.get("/v1/jobs").json()["jobs"] == []
+        problem(other.get(f"/v1/jobs/{job['id']}"), "unknown-job", 404)
+
+
+# Every route, with the ids of another owner
+
+Files = dict[str, tuple[str, bytes]]
+NEVER = "f" * 32
+FREE = {"frame": "0", "slug": "internal", "array": "shapes", "role": "measurements", "name": "x"}
+"""Parameters of paths that name nothing of an owner."""
+
+TUS = {
+    "Tus-Resumable": "1.0.0",
+    "Upload-Offset": "0",
+    "Upload-Length": "8",
+    "Content-Type": "application/offset+octet-stream",
+}
+
+
+def make_job(client: httpx.Client, files: Files) -> str:
+    return str(submit(client, files).json()["id"])
+
+
+def make_upload(client: httpx.Client, files: Files) -> str:
+    answer = client.post("/v1/uploads", headers={"Tus-Resumable": "1.0.0", "Upload-Length": "800"})
+    assert answer.status_code == 201, answer.text
+    return answer.headers["Location"].rpartition("/")[2]
+
+
+def make_batch(client: httpx.Client, files: Files) -> str:
+    answer = client.post("/v1/jobs", files=files, data={"batch": "walk-17"})
+    assert answer.status_code == 201, answer.text
+    return "walk-17"
+
+
+OWNED = {"job_id": make_job, "upload_id": make_upload, "label": make_batch}
+"""Parameters of paths that name something of an owner, and how one is made."""
+
+UNSEEN = {"job_id": NEVER, "upload_id": NEVER, "label": "never"}
+BLIND = frozenset({"OPTIONS"})
+"""Methods that may answer alike whether there is anything or not."""
+
+
+@dataclass(frozen=True)
+class Operation:
+    method: str
+    template: str
+    parameters: tuple[str, ...]
+
+    @property
+    def owned(self) -> tuple[str, ...]:
+        return tuple(name for name in self.parameters if name not in FREE)
+
+    def url(self, values: Mapping[str, str]) -> str:
+        return self.template.format(**{**FREE, **values})
+
+
+def operations() -> list[Operation]:
+    """Every method of every route of the application, with nothing left out."""
+    found = []
+    routes = create_app(Settings(redis_url="redis://localhost")).routes
+    for context in iter_route_contexts(routes):
+        if isinstance(context.route, Mount):
+            assert context.path == "/static-offline-docs"
+            continue
+        template = re.sub(r":\w+\}", "}", context.path or "")
+        names = tuple(re.findall(r"\{(\w+)\}", template))
+        unknown = set(names) - FREE.keys() - OWNED.keys()
+        assert not unknown, f"{template}: say in this file how {unknown} are filled"
+        assert context.methods, context
+        found += [Operation(method, template, names) for method in sorted(context.methods)]
+    return found
+
+
+def reduced(answer: httpx.Response, values: Mapping[str, str]) -> tuple[object, ...]:
+    """What an answer says, without the ids and what differs from one request to the next."""
+    text = answer.text
+    for value in values.values():
+        text = text.replace(value, "ID")
+    volatile = ("date", "ratelimit", "content-length")
+    headers = {k: v for k, v in answer.headers.items() if k not in volatile}
+    return answer.status_code, text, headers
+
+
+def ask(client: httpx.Client, operation: Operation, values: Mapping[str, str]) -> httpx.Response:
+    """Make a request that would do all it can; of an endless stream take the beginning."""
+    headers = TUS if "upload_id" in operation.parameters else {}
+    body = b"x" * 8 if operation.method in ("PUT", "PATCH", "POST") else None
+    url = operation.url(values)
+    timeout = httpx.Timeout(30, read=1.5 if operation.template.endswith("/events") else 30)
+    with client.stream(
+        operation.method, url, headers=headers, content=body, timeout=timeout
+    ) as answer:
+        text = bytearray()
+        with contextlib.suppress(httpx.ReadTimeout):
+            for chunk in answer.iter_raw():
+                text += chunk
+    return httpx.Response(
+        answer.status_code, headers=answer.headers, content=bytes(text), request=answer.request
+    )
+
+
+def state_of(api: Api) -> dict[bytes, object]:
+    """All that is stored, but for what counts requests and times."""
+    redis = api.redis.client()
+    kept: dict[bytes, object] = {name.encode(): None for name in api.stored()}
+    for key in redis.scan_iter():
+        if not key.startswith((b"smsr:rate", b"smsr:looking", b"smsr:orphans")):
+            kept[key] = redis.dump(key)
+    return kept
+
+
+def test_no_route_shows_or_changes_what_is_anothers(guarded: Guarded, files: Files) -> None:
+    walked = 0
+    unlimited = {"requests_per_minute": 0}
+    with guarded.client("ann", **unlimited) as ann, guarded.client("bob", **unlimited) as bob:
+        every = operations()
+        needed = {name for operation in every for name in operation.owned}
+        values = {name: OWNED[name](ann, files) for name in needed}
+        before = state_of(guarded.api)
+        for operation in every:
+            answer = ask(bob, operation, values)
+            if operation.owned:
+                never = ask(bob, operation, UNSEEN)
+                assert reduced(answer, values) == reduced(never, UNSEEN), operation
+                if operation.method not in BLIND:
+                    assert answer.status_code == 404, (operation, answer.text)
+                walked += 1
+            else:
+                for value in values.values():
+                    assert value not in answer.text, operation
+            assert answer.status_code < 500, operation
+        assert state_of(guarded.api) == before
+        assert walked >= 18
+        # That the ids were good ones:
+        for operation in every:
+            if operation.owned and operation.method == "GET":
+                own = ask(ann, operation, values)
+                assert own.status_code != 404 or "unknown-job" not in own.text, operation
+
+
+def test_without_a_key_only_what_is_public_answers(guarded: Guarded, files: Files) -> None:
+    public = {"/", "/docs", "/healthz", "/openapi.json", "/problems", "/problems/{slug}", "/readyz"}
+    public |= {"/assets/{name}", *PUBLIC}
+    with guarded.client("ann") as ann, guarded.api.client() as anyone:
+        values = {name: OWNED[name](ann, files) for o in operations() for name in o.owned}
+        before = state_of(guarded.api)
+        for operation in operations():
+            answer = ask(anyone, operation, values)
+            if operation.template in public:
+                assert answer.status_code not in (401, 404, 500), operation
+            else:
+                assert answer.status_code == 401, operation
+        assert state_of(guarded.api) == before
+
+
+# Limits
+
+
+def test_requests_are_limited_key_by_key(guarded: Guarded) -> None:
+    with guarded.client("ann", requests_per_minute=3) as one, guarded.client("ann") as other:
+        left = []
+        for _ in range(3):
+            answer = one.get("/v1/jobs")
+            assert answer.status_code == 200
+            assert answer.headers["RateLimit-Policy"] == '"requests";q=3;w=60'
+            found = re.fullmatch(r'"requests";r=(\d+);t=(\d+)', answer.headers["RateLimit"])
+            assert found
+            left.append(int(found[1]))
+            assert 1 <= int(found[2]) <= 60
+        assert left == [2, 1, 0]
+        answer = one.get("/v1/jobs/" + NEVER)
+        document = problem(answer, "too-many-requests", 429)
+        assert document["limit"] == 3
+        assert 1 <= int(answer.headers["Retry-After"]) <= 60
+        assert answer.headers["RateLimit"].startswith('"requests";r=0;')
+        assert other.get("/v1/jobs").headers["RateLimit-Policy"] == '"requests";q=600;w=60'
+        assert one.get("/v1/info").status_code == 200
+    with guarded.client("ann", requests_per_minute=0) as unlimited:
+        assert "RateLimit" not in unlimited.get("/v1/jobs").headers
+
+
+def test_jobs_are_limited_owner_by_owner(guarded: Guarded, files: Files) -> None:
+    with guarded.client("ann", jobs=1) as ann, guarded.client("bob", jobs=1) as bob:
+        job = submit(ann, files).json()
+        answer = submit(ann, files)
+        assert problem(answer, "too-many-jobs", 429)["limit"] == 1
+        assert int(answer.headers["Retry-After"]) > 0
+        assert submit(bob, files).status_code == 201
+        ann.post(f"/v1/jobs/{job['id']}/cancel")
+        assert submit(ann, files).status_code == 201
+        answer = ann.post(f"/v1/jobs/{job['id']}/retry")
+        problem(answer, "too-many-jobs", 429)
+        assert len(guarded.api.stored()) == 3
+
+
+def test_bytes_are_limited_owner_by_owner(guarded: Guarded) -> None:
+    big = {"measurements": ("t.npy", npy(np.random.default_rng(0).normal(size=(100, 1000))))}
+    records_of = guarded.api.redis.client()
+    with guarded.client("ann", stored_bytes=2_000_000) as ann, guarded.client("bob") as bob:
+        first = submit(ann, big)
+        assert first.status_code == 201
+        assert submit(ann, big).status_code == 201
+        answer = submit(ann, big)
+        assert problem(answer, "too-many-bytes", 507)["limit"] == 2_000_000
+        assert int(answer.headers["Retry-After"]) > 0
+        assert submit(bob, big).status_code == 201
+        assert ann.delete(first.headers["Location"]).status_code == 204
+        assert submit(ann, big).status_code == 201
+        stored = int(records_of.hget("smsr:stored", "ann") or 0)
+        assert stored == 2 * len(big["measurements"][1])
+        assert not list(records_of.scan_iter("smsr:hold:*"))
+
+
+def test_an_upload_of_unknown_length_is_limited_too(guarded: Guarded) -> None:
+    head = npy(np.zeros((100, 40_000)))[:128]
+    sent = 0
+
+    def body() -> Iterator[bytes]:
+        nonlocal sent
+        yield (
+            b'--xx\r\nContent-Disposition: form-data; name="measurements"; filename="t.npy"\r\n\r\n'
+        ) + head
+        for _ in range(28):
+            time.sleep(0.01)
+            sent += 1
+            yield b"\0" * (1 << 20)
+        yield b"\r\n--xx--\r\n"
+
+    with guarded.client("ann", stored_bytes=4 << 20) as ann:
+        kind = {"Content-Type": "multipart/form-data; boundary=xx"}
+        problem(ann.post("/v1/jobs", content=body(), headers=kind), "too-many-bytes", 507)
+    assert not guarded.api.stored()
+    assert not guarded.api.redis.client().hgetall("smsr:stored")
+
+
+def test_a_refused_upload_is_held_no_longer(guarded: Guarded) -> None:
+    with guarded.client("ann") as ann:
+        refused = submit(ann, {"measurements": ("t.npy", npy(np.zeros((5, 9))))})
+        problem(refused, "odd-row-count", 422)
+    assert not guarded.api.redis.client().hgetall("smsr:stored")
+
+
+# What is told to whom
+
+
+def test_metrics_and_readiness_tell_nothing_of_jobs(guarded: Guarded, files: Files) -> None:
+    with guarded.client("ann") as ann, guarded.api.client() as anyone:
+        submit(ann, files)
+        assert anyone.get("/readyz").json()["queued"] is None
+        for client in (ann, anyone):
+            answer = client.get("/metrics")
+            problem(answer, "unauthorized", 401)
+        token = {"Authorization": "Bearer a-token-for-metrics"}
+        assert 'smsr_jobs{status="queued"} 1.0' in anyone.get("/metrics", headers=token).text
+
+
+def test_what_redis_holds_opens_nothing(guarded: Guarded, files: Files) -> None:
+    _, key = guarded.keys.create("ann")
+    with guarded.api.client(headers={"X-API-Key": key}) as client:
+        submit(client, files)
+    secret = key.split("_")[2].encode()
+    assert secret not in (guarded.api.redis.folder / "redis.log").read_bytes()
+    for path in guarded.api.redis.folder.rglob("*.aof"):
+        assert secret not in path.read_bytes()
+    assert secret.decode() not in guarded.api.log.read_text()
+
+
+# The open mode
+
+
+@pytest.mark.parametrize(
+    ("access", "address", "policy"),
+    [
+        ("auto", "127.0.0.1", "loopback"),
+        ("auto", "127.8.8.8", "loopback"),
+        ("auto", "::1", "loopback"),
+        ("auto", "0.0.0.0", "keys"),
+        ("auto", "::", "keys"),
+        ("auto", "10.0.0.1", "keys"),
+        ("auto", None, "keys"),
+        ("open", "0.0.0.0", "open"),
+        ("open", None, "open"),
+        ("keys", "127.0.0.1", "keys"),
+    ],
+)
+def test_who_may_come(access: str, address: str | None, policy: str) -> None:
+    settings = Settings(redis_url="redis://localhost", access=access)
+    assert policy_for(settings, address) == policy
