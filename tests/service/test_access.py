@@ -95,7 +95,7 @@ def test_a_key_is_given_in_either_header(guarded: Guarded, anyone: httpx.Client)
         {"Authorization": f"Basic {key}"},
         {"Authorization": f"Bearer {key[:-1]}"},
         {"Authorization": "Bearer x"},
-        {"X-API-Key": "é".encode()},
+        {"X-API-Key": "smsr_0_1"},
     ):
         problem(anyone.get("/v1/jobs", headers=headers), "unauthorized", 401)
     answer = anyone.get(f"/v1/jobs?api_key={key}")
@@ -227,7 +227,8 @@ def state_of(api: Api) -> dict[bytes, object]:
     kept: dict[bytes, object] = {name.encode(): None for name in api.stored()}
     for key in redis.scan_iter():
         if not key.startswith((b"smsr:rate", b"smsr:looking", b"smsr:orphans")):
-            kept[key] = redis.dump(key)
+            # The dump of a hash has its fields in any order.
+            kept[key] = redis.hgetall(key) if redis.type(key) == b"hash" else redis.dump(key)
     return kept
 
 
@@ -406,5 +407,5 @@ def test_what_redis_holds_opens_nothing(guarded: Guarded, files: Files) -> None:
     ],
 )
 def test_who_may_come(access: str, address: str | None, policy: str) -> None:
-    settings = Settings(redis_url="redis://localhost", access=access)
+    settings = Settings(redis_url="redis://localhost", access=access)  # type: ignore[arg-type]
     assert policy_for(settings, address) == policy
