@@ -237,7 +237,8 @@ async def accept(
             partial(shared.queue.submit, record, shared.allowance, uploads, reuse=reuse)
         )
     except (TooManyJobs, TooManyBytes):
-        await discard_uploads(shared.storage, record.id)
+        if not submission.from_uploads:
+            await discard_uploads(shared.storage, record.id)
         raise
     except RedisError:
         # A record without a place in the queue gets one by maintenance: it is accepted. Where not
