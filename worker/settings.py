@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from pydantic import AliasChoices, Field
+from pydantic import AliasChoices, Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from worker.cgroup import available_cores, memory_limit
@@ -163,6 +163,11 @@ class Settings(BaseSettings):
         description="Time between signs of life in a stream of events; less than the idle limit of "
         "proxies.",
     )
+
+    @field_validator("metrics_token", mode="before")
+    @classmethod
+    def _none_when_empty(cls, given: object) -> object:
+        return given or None  # how files of containers leave something unset
 
     log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR|CRITICAL)$")
 

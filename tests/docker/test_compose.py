@@ -81,6 +81,13 @@ def test_system_units_set_what_the_code_reads() -> None:
     assert set(re.findall(r"\b(?:SMSR_[A-Z_]+|REDIS_URL)(?==)", text)) <= known
 
 
+def test_who_may_use_the_service_is_said_by_name() -> None:
+    environment = services("compose.yaml")["api"]["environment"]
+    assert environment["SMSR_ACCESS"] == "${SMSR_ACCESS:-open}"
+    example = (DOCKER / "systemd" / "smsr.env.example").read_text()
+    assert re.search("^SMSR_ACCESS=keys$", example, re.MULTILINE)
+
+
 def test_images_are_pinned() -> None:
     for file, name in all_services():
         image = services(file)[name].get("image", "")

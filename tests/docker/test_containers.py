@@ -238,7 +238,7 @@ def test_a_job_that_the_kernel_kills_fails_clearly_too(image: str, tmp_path: Pat
     """Where the budget is set too high, the kernel ends the job; it is not tried for ever."""
     port = free_port()
     options = ["--memory", "400m", "--memory-swap", "400m", "--publish", f"127.0.0.1:{port}:8000"]
-    options += ["--env", f"SMSR_JOB_MEMORY_BYTES={1 << 40}"]
+    options += ["--env", f"SMSR_JOB_MEMORY_BYTES={1 << 40}", "--env", "SMSR_ACCESS=open"]
     with alone(image, *options) as name, Client(f"http://127.0.0.1:{port}") as client:
         sender = Sender(client, tmp_path)
         ended = client.wait(sender.send(too_large()).id, timeout=300)

@@ -149,6 +149,15 @@ def test_settings_are_ones_that_the_code_reads(
     Settings.model_validate({n.removeprefix("SMSR_").lower(): settings[n] for n in ours})
 
 
+@pytest.mark.parametrize("overlay", OVERLAYS)
+def test_a_service_with_an_ingress_needs_keys(
+    rendered: dict[str, list[Manifest]], overlay: str
+) -> None:
+    assert any(m["kind"] == "Ingress" for m in rendered[overlay])
+    (settings,) = (m["data"] for m in rendered[overlay] if m["kind"] == "ConfigMap")
+    assert settings["SMSR_ACCESS"] == "keys"
+
+
 def test_a_worker_has_time_to_hand_its_job_back(rendered: dict[str, list[Manifest]]) -> None:
     (settings,) = (m["data"] for m in rendered["cluster"] if m["kind"] == "ConfigMap")
     pod = pick(rendered["cluster"], "Deployment", "worker")["spec"]["template"]["spec"]
