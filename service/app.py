@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 from anyio import to_thread
@@ -23,6 +23,7 @@ from service.metrics import MeasuredRequests, Metrics
 from service.routes import events, health, info, jobs, metrics, page, results, uploads
 from service.routes import problems as problem_pages
 from service.security import SecurityHeaders
+from service.webhooks import Deliverer
 from worker.changes import ChangeFeed
 from worker.connections import connect_async
 from worker.maintenance import Maintenance
@@ -126,13 +127,16 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
             app.state.context = Context(
                 settings, queue, feed, opened, measured, uploaded, Digests()
             )
-            keeper = asyncio.create_task(_keep_order(queue), name="maintenance")
+            beside = [asyncio.create_task(_keep_order(queue), name="maintenance")]
+            if settings.webhook_secret:
+                deliverer = Deliverer(settings, queue.redis)
+                beside.append(asyncio.create_task(deliverer.run(), name="webhooks"))
             try:
                 yield
             finally:
-                keeper.cancel()
-                with suppress(asyncio.CancelledError):
-                    await keeper
+                for task in beside:
+                    task.cancel()
+                await asyncio.gather(*beside, return_exceptions=True)
                 queue.redis.close()
                 measured.close()
 

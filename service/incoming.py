@@ -15,7 +15,7 @@ from starlette.requests import ClientDisconnect
 from service.bodies import Body
 from service.digests import BodyDigests
 from service.problems import Problem
-from service.submissions import SETTINGS, Submission, read_settings
+from service.submissions import SETTINGS, Submission, check_webhook, read_settings
 from service.uploads import FILES, OPTIONS_BYTES, UploadLimits, check_files
 from smsr.errors import SmsrError
 from smsr.files import HEAD_BYTES, check_prefix
@@ -372,6 +372,7 @@ async def receive_references(request: Request, job_id: str, shared: Context) -> 
     settings = read_settings(
         {name: document[name] for name in SETTINGS if name in document}, shared.settings
     )
+    await check_webhook(shared.settings, settings)
     uploads = {role: await finish(shared, await find(shared, id_)) for role, id_ in ids.items()}
     frames, points = await _check(shared, uploads, options)
     inputs = await _take(shared, uploads, job_id)

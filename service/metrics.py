@@ -22,6 +22,7 @@ from service.problems import JOB_PROBLEMS
 from smsr import STAGES
 from worker.connections import connect
 from worker.counters import BOUNDS, SIZES, UNKNOWN_SIZE, Counters, Histogram
+from worker.outbox import OUTCOMES
 from worker.records import FINAL, RecordStore
 
 if TYPE_CHECKING:
@@ -152,6 +153,12 @@ def _ends(counters: Counters) -> Iterator[Metric]:
     yield failures
     lost = "Attempts that ended with their worker."
     yield CounterMetricFamily("smsr_attempts_lost", lost, counters.lost)
+    webhooks = CounterMetricFamily(
+        "smsr_webhook_attempts", "Attempts to deliver webhooks.", labels=["outcome"]
+    )
+    for outcome in OUTCOMES:
+        webhooks.add_metric([outcome], counters.webhooks.get(outcome, 0))
+    yield webhooks
 
 
 def _durations(counters: Counters) -> Iterator[Metric]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -127,6 +128,20 @@ class JobLinks(BaseModel):
     report: str | None = Field(description="report.json")
 
 
+class JobWebhook(BaseModel):
+    """How the webhook of a job stands."""
+
+    host: str = Field(description="Host that is told; the rest of the address is not shown.")
+    state: Literal["waiting", "pending", "delivered", "given_up"] = Field(
+        description="`waiting` for the job to end and a first attempt, `pending` for another one."
+    )
+    attempts: int = Field(description="Attempts for the last end of the job.")
+    delivered_at: datetime | None = None
+    next_attempt_at: datetime | None = None
+    status: int | None = Field(None, description="HTTP status of the last answer.")
+    error: str | None = Field(None, description="What went wrong in the last attempt.")
+
+
 class Job(BaseModel):
     """A job and all that is known of it."""
 
@@ -177,6 +192,7 @@ class Job(BaseModel):
                         "cautions": [],
                     },
                     "problem": None,
+                    "webhook": None,
                     "links": {
                         "self": _SELF,
                         "cancel": None,
@@ -235,6 +251,7 @@ class Job(BaseModel):
         description="Of a job that succeeded, in the document of one job."
     )
     problem: ProblemDocument | None = Field(description="Why a job failed.")
+    webhook: JobWebhook | None = Field(None, description="Where one was asked for.")
     links: JobLinks
 
 
@@ -377,6 +394,7 @@ def job_document(
         metrics=None if record.metrics is None else _metrics(record.metrics, brief=brief),
         diagnostics=DiagnosticsSummary.model_validate(diagnostics) if diagnostics else None,
         problem=problem,
+        webhook=_webhook(record),
         links=JobLinks(
             self=here,
             cancel=f"{here}/cancel" if active else None,
@@ -412,6 +430,15 @@ def upload_document(upload: Upload, *, root: str = "") -> UploadDocument:
             job=f"{root}/v1/jobs/{upload.job}" if upload.job else None,
         ),
     )
+
+
+def _webhook(record: JobRecord) -> JobWebhook | None:
+    if record.webhook is None:
+        return None
+    known = dict(record.webhook_state or {"state": "waiting", "attempts": 0})
+    for moment in ("delivered_at", "next_attempt_at"):
+        known[moment] = _moment_or_none(float(known[moment])) if moment in known else None
+    return JobWebhook(host=urlsplit(record.webhook).hostname or "", **known)
 
 
 def _metrics(metrics: Mapping[str, Any], *, brief: bool) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from redis.exceptions import RedisError
 
 import smsr
 from service.problems import Problem
+from service.targets import MAX_URL, TargetRefused, Targets
 from worker.records import JobRecord, Priority, TooManyBytes, TooManyJobs, upload_prefix
 from worker.settings import Settings
 from worker.storage import StorageError
@@ -83,6 +84,26 @@ class JobSettings(BaseModel):
         "Without it the service decides, which says yes unless its operator has chosen otherwise.",
     )
 
+    webhook: Annotated[str, Field(max_length=MAX_URL)] | None = Field(
+        default=None,
+        description="https:// address on the public Internet that is told when the job has ended, "
+        "by a signed POST (Standard Webhooks).",
+        examples=["https://example.org/hooks/smsr"],
+    )
+
+    @field_validator("webhook")
+    @classmethod
+    def _acceptable(cls, webhook: str | None, info: ValidationInfo) -> str | None:
+        operator = info.context
+        if webhook is not None and isinstance(operator, Settings):
+            if not operator.webhook_secret:
+                raise PydanticCustomError("no_webhooks", "this service sends no webhooks")
+            try:
+                Targets(operator).parse(webhook)
+            except TargetRefused as refusal:
+                raise _bad_target(refusal) from None
+        return webhook
+
     @field_validator("ttl")
     @classmethod
     def _within_bounds(cls, ttl: float | None, info: ValidationInfo) -> float | None:
@@ -94,6 +115,12 @@ class JobSettings(BaseModel):
                     "ttl_too_long", "the service keeps jobs for at most {most} s", {"most": longest}
                 )
         return ttl
+
+
+def _bad_target(refusal: TargetRefused) -> PydanticCustomError:
+    return PydanticCustomError(
+        "webhook_refused", "webhooks cannot go to this address: {why}", {"why": str(refusal)}
+    )
 
 
 SETTINGS = tuple(JobSettings.model_fields)
@@ -218,6 +245,12 @@ async def accept(
         The owner may not have another one.
     """
     settings = submission.settings
+    if not submission.from_uploads:
+        try:
+            await check_webhook(shared.settings, settings)
+        except Problem:
+            await discard_uploads(shared.storage, job_id)
+            raise
     record = JobRecord.new(
         job_id,
         options=dataclasses.asdict(submission.options),
@@ -230,6 +263,7 @@ async def accept(
         digest=digest_of(submission, shared.owner),
         frames=submission.frames,
         points=submission.points,
+        webhook=settings.webhook,
     )
     reuse = shared.settings.reuse_results if settings.reuse is None else settings.reuse
     try:
@@ -249,6 +283,22 @@ async def accept(
         if not submission.from_uploads:
             await discard_uploads(shared.storage, record.id)
         raise
+
+
+async def check_webhook(operator: Settings, settings: JobSettings) -> None:
+    """Refuse a webhook whose host has no address that it may go to."""
+    if settings.webhook is None:
+        return
+    targets = Targets(operator)
+    try:
+        await targets.addresses(targets.parse(settings.webhook))
+    except TargetRefused as refusal:
+        raise Problem(
+            "invalid-setting",
+            f"webhook: {_bad_target(refusal).message()}.",
+            setting="webhook",
+            settings=list(SETTINGS),
+        ) from None
 
 
 async def discard_uploads(storage: ObjectStorage, job_id: str) -> None:

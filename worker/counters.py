@@ -83,6 +83,8 @@ class Counters:
         From the last start to the end, by size class (`SIZES` and `UNKNOWN_SIZE`).
     stages : dict of str to Histogram
         Stages of the jobs that succeeded.
+    webhooks : dict of str to int
+        Attempts to deliver webhooks by how they ended: delivered, failed, given_up.
     """
 
     ended: dict[str, int] = field(default_factory=dict)
@@ -92,6 +94,7 @@ class Counters:
     waits: Histogram = field(default_factory=Histogram)
     runs: dict[str, Histogram] = field(default_factory=dict)
     stages: dict[str, Histogram] = field(default_factory=dict)
+    webhooks: dict[str, int] = field(default_factory=dict)
 
 
 def decode(found: Mapping[bytes, bytes]) -> Counters:
@@ -107,6 +110,8 @@ def decode(found: Mapping[bytes, bytes]) -> Counters:
                 counters.lost = int(value)
             case ["reused"]:
                 counters.reused = int(value)
+            case ["webhook", outcome]:
+                counters.webhooks[outcome] = int(value)
             case ["wait", part]:
                 counters.waits._add(part, value)
             case ["run", size, part]:

@@ -35,7 +35,7 @@ Status: TypeAlias = Literal["queued", "running", "succeeded", "failed", "cancell
 STATUSES: tuple[Status, ...] = get_args(Status)
 FINAL: tuple[Status, ...] = ("succeeded", "failed", "cancelled")
 
-_DOCUMENTS = ("options", "inputs", "progress", "metrics", "timings", "problem")
+_DOCUMENTS = ("options", "inputs", "progress", "metrics", "timings", "problem", "webhook_state")
 _NO_STAGES = ("queued", "total")
 _PAGE_LIMIT = 1000
 _SCRIPT = counters.LUA + (
@@ -155,6 +155,10 @@ class JobRecord:
         Name of the worker that runs it.
     version : int
         Grows with every visible change.
+    webhook : str or None
+        Address that is told when the job ends.
+    webhook_state : dict or None
+        How that stands: 'state', 'attempts' and what else `outbox.lua` notes.
     """
 
     id: str
@@ -184,6 +188,8 @@ class JobRecord:
     cancel_requested: bool = False
     worker: str | None = None
     version: int = 0
+    webhook: str | None = None
+    webhook_state: Mapping[str, Any] | None = None
 
     @classmethod
     def new(
@@ -200,6 +206,7 @@ class JobRecord:
         digest: str | None = None,
         frames: int | None = None,
         points: int | None = None,
+        webhook: str | None = None,
     ) -> JobRecord:
         """Return the record of a job to submit; Redis stamps its time of creation."""
         return cls(
@@ -216,6 +223,7 @@ class JobRecord:
             digest=digest,
             frames=frames,
             points=points,
+            webhook=webhook,
         )
 
     @property
@@ -628,7 +636,7 @@ class RecordStore:
             "options": _encode(record.options),
             "inputs": _encode({r: dataclasses.asdict(f) for r, f in record.inputs.items()}),
         }
-        for name in ("name", "batch", "priority", "ttl", "digest", "frames", "points"):
+        for name in ("name", "batch", "priority", "ttl", "digest", "frames", "points", "webhook"):
             value = getattr(record, name)
             if value is not None:
                 fields[name] = value
@@ -890,6 +898,8 @@ def decode(job_id: str, found: Mapping[bytes, bytes]) -> JobRecord | None:
         cancel_requested="cancel_requested_at" in texts or texts["status"] == "cancelled",
         worker=texts.get("worker"),
         version=int(texts["version"]),
+        webhook=texts.get("webhook"),
+        webhook_state=documents.get("webhook_state"),
     )
 
 

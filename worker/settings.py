@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import ipaddress
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import AliasChoices, Field, field_validator
+from pydantic_core import PydanticCustomError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from worker.cgroup import available_cores, memory_limit
@@ -164,12 +167,68 @@ class Settings(BaseSettings):
         "proxies.",
     )
 
-    @field_validator("metrics_token", mode="before")
+    public_url: str | None = Field(
+        default=None,
+        pattern=r"^https?://[^\s?#]+[^\s?#/]$",
+        description="Address at which clients reach the API, for links in webhooks; without it "
+        "they are paths.",
+    )
+    webhook_secret: str = Field(
+        default="",
+        repr=False,
+        description="Keys that sign webhooks, as whsec_ and base64 of 24 to 64 bytes; several with "
+        "spaces while a key is changed, the new one first. Without one there are no webhooks.",
+    )
+    webhook_http: bool = Field(
+        default=False, description="Whether webhooks may go to http:// addresses, unencrypted."
+    )
+    webhook_allow: str = Field(
+        default="",
+        description="Networks, with commas, that webhooks may go to although they are not public, "
+        "as 10.1.0.0/16.",
+    )
+    webhook_timeout_seconds: float = Field(
+        default=15, gt=0, le=120, description="Longest time of one attempt to deliver a webhook."
+    )
+    webhook_pauses: tuple[Annotated[float, Field(gt=0, le=7 * DAY)], ...] = Field(
+        default=(5, 300, 1800, 7200, 18000, 36000, 36000),
+        description="Seconds between the attempts to deliver a webhook, as a JSON list; it is "
+        "given up after the last one.",
+    )
+
+    @field_validator("metrics_token", "public_url", mode="before")
     @classmethod
     def _none_when_empty(cls, given: object) -> object:
         return given or None  # how files of containers leave something unset
 
     log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR|CRITICAL)$")
+
+    @field_validator("webhook_secret")
+    @classmethod
+    def _whole_keys(cls, keys: str) -> str:
+        for key in keys.split():
+            try:
+                decoded = base64.b64decode(key.removeprefix("whsec_"), validate=True)
+            except ValueError:
+                decoded = b""
+            if not key.startswith("whsec_") or not 24 <= len(decoded) <= 64:
+                # The key itself is not told: the message ends up in logs.
+                raise PydanticCustomError(
+                    "webhook_secret", "each key is whsec_ and the base64 of 24 to 64 bytes"
+                )
+        return keys
+
+    @field_validator("webhook_allow")
+    @classmethod
+    def _networks(cls, networks: str) -> str:
+        for network in networks.replace(",", " ").split():
+            ipaddress.ip_network(network)
+        return networks
+
+    @property
+    def webhook_networks(self) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:
+        """Networks that webhooks may go to although they are not public."""
+        return tuple(map(ipaddress.ip_network, self.webhook_allow.replace(",", " ").split()))
 
     @property
     def objects_url(self) -> str:

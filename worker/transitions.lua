@@ -24,6 +24,7 @@
 --   holds                        sorted set of ids of holds by the time they lapse
 --   counters                     hash: counts of all jobs (`worker.counters`, which also gives the
 --                                `bounds` of histograms and the `sizes` of jobs used here)
+--   webhooks, webhook:{message}  messages about ends of jobs (`outbox.lua`)
 --   changed:{id}                 channel: the record's version at every visible change, or
 --                                'deleted'; a space; the owner
 --
@@ -217,6 +218,19 @@ local function size_of(key)
   return 'unknown'
 end
 
+-- Puts the news of a job that has ended into the outbox, with the record as it is now.
+local function notify(job)
+  local key = prefix .. 'job:' .. job
+  if read(key, 'webhook') then
+    local message = 'msg_' .. job .. '_' .. redis.call('HINCRBY', key, 'webhook_count', 1)
+    redis.call('HSET', key, 'webhook_message', message)
+    redis.call('HDEL', key, 'webhook_state')
+    redis.call('COPY', key, prefix .. 'webhook:' .. message)
+    redis.call('HSET', prefix .. 'webhook:' .. message, 'of_job', job, 'attempts', 0)
+    redis.call('ZADD', prefix .. 'webhooks', stamp(now), message)
+  end
+end
+
 -- Ends a job, without counting it. The time to live is the job's own or the one given; 0 keeps it
 -- for ever.
 local function close(job, status, ttl)
@@ -239,6 +253,7 @@ local function close(job, status, ttl)
   end
   set_status(job, status)
   changed(job)
+  notify(job)
 end
 
 -- Ends a job that was to be run.
