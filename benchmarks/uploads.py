@@ -181,7 +181,9 @@ def clean(folder: Path) -> None:
     os.sync()
 
 
-def measure(folder: Path, mib: int, runs: int) -> tuple[Series, dict[str, Series]]:
+def measure(
+    folder: Path, mib: int, runs: int, ways: Mapping[str, Callable[[Server, Path], None]]
+) -> tuple[Series, dict[str, Series]]:
     """Run all uploads, bare and service in turns."""
     path = folder / "w.npy"
     points = mib * MIB // (4 * ROWS)
@@ -191,7 +193,7 @@ def measure(folder: Path, mib: int, runs: int) -> tuple[Series, dict[str, Series
         for _ in range(4 * ROWS * points // MIB):
             file.write(block)
     (folder / "bare.py").write_text(BARE, encoding="utf-8")
-    bare, found = Series(), {name: Series() for name in WAYS}
+    bare, found = Series(), {name: Series() for name in ways}
     environment: dict[str, str] = {
         "SMSR_DATA_DIR": str(folder / "data"),
         "SMSR_ACCESS": "open",
@@ -208,10 +210,10 @@ def measure(folder: Path, mib: int, runs: int) -> tuple[Series, dict[str, Series
             small = folder / "small.npy"
             small.write_bytes(npy_header((ROWS, 16), "<f4") + bytes(4 * ROWS * 16))
             to_bare(plain, path)  # the file is read once, and both servers are warm
-            for way in WAYS.values():
+            for way in ways.values():
                 way(service, small)
             for number in range(runs):
-                for name, way in WAYS.items():
+                for name, way in ways.items():
                     clean(folder)
                     wall, cpu = timed(plain, to_bare, path)
                     clean(folder)
@@ -237,10 +239,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--mib", type=int, default=1024, help="size of the matrix")
     parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     parser.add_argument("--folder", type=Path, default=None, help="where to write")
     given: Any = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as folder:
-        bare, found = measure(Path(folder), given.mib, given.runs)
+        bare, found = measure(Path(folder), given.mib, given.runs, {w: WAYS[w] for w in given.ways})
     middle = statistics.median
     print(f"{given.mib} MiB, medians of {given.runs} runs\n")
     print("| way | s | MiB/s | of bare | of bare, CPU | grown, MiB |\n|---|---|---|---|---|---|")

@@ -48,7 +48,9 @@ if TYPE_CHECKING:
     from worker.records import InputFile
     from worker.uploads import UploadStore
 
-LOCAL_BLOCK_BYTES = 4 << 20
+BLOCK_BYTES = 512 << 10
+"""What is hashed and written at once: small enough to be in the processor's cache still."""
+SAFE_BYTES = 4 << 20
 PART_BYTES = 8 << 20
 """What is made safe at once, in a local folder and in a bucket: a killed process loses less."""
 
@@ -127,9 +129,9 @@ async def receive_whole(request: Request, shared: Context, upload: Upload) -> bo
 
     async def blocks() -> AsyncIterator[bytes]:
         renewed, size = time.monotonic(), 0
-        while block := await body.block(LOCAL_BLOCK_BYTES):
+        while block := await body.block(BLOCK_BYTES):
             if size == 0:
-                ended = len(block) < LOCAL_BLOCK_BYTES
+                ended = len(block) < BLOCK_BYTES
                 check_head(block[:HEAD_BYTES], len(block) if ended else None, upload, limits)
             size += len(block)
             if size > limits.bytes:
@@ -256,6 +258,10 @@ class _Piece:
         self._sha256 = shared.digests.at(upload.folder, offset)
         self._head: bytes | None = None
         """The first bytes of the file until they have been looked at."""
+        self._blocks: list[bytes] = []
+        self._handed = offset
+        self._writing: asyncio.Future[None] | None = None
+        self._hashing: asyncio.Future[None] | None = None
 
     async def receive(self, body: Body) -> Upload:
         upload, shared = self._upload, self._shared
@@ -265,26 +271,25 @@ class _Piece:
                 beginning, shared.uploads, shared.storage, upload, self._offset
             )
         broken: Exception | None = None
-        writing: asyncio.Task[None] | None = None
-        block_bytes = LOCAL_BLOCK_BYTES if shared.storage.folder is not None else PART_BYTES
+        at_once = SAFE_BYTES if shared.storage.folder is not None else PART_BYTES
         received = self._offset
         while broken is None:
             try:
-                block = await body.block(block_bytes)
+                block = await body.block(BLOCK_BYTES)
             except (ClientDisconnect, Problem) as error:
                 broken, block = error, body.rest()
-            if writing is not None:
-                await writing  # while the block after it arrived
-                writing = None
             if not block:
                 break
             received += len(block)
             if received > upload.length:
                 raise _too_long(upload)
             self._look(block, received)
-            writing = asyncio.create_task(self._store(block))
-        if writing is not None:
-            await writing
+            await self._hash(block)
+            self._blocks.append(block)
+            if received - self._handed >= at_once:
+                await self._write(received)
+        await self._write(received)
+        await self._settle()
         if broken is None and self._digests:
             self._digests.verify()
             await to_thread.run_sync(self._writer.commit)
@@ -306,16 +311,31 @@ class _Piece:
             check_head(self._head, self._upload.length, self._upload, limits_of(self._shared))
             self._head = None
 
-    async def _store(self, block: bytes) -> None:
-        """Write a block, and hash it beside."""
-        await asyncio.gather(
-            to_thread.run_sync(self._writer.write, block), to_thread.run_sync(self._hash, block)
-        )
+    async def _hash(self, block: bytes) -> None:
+        """Hash a block while the one after it arrives."""
+        if self._hashing is not None:
+            await self._hashing
+        self._hashing = asyncio.ensure_future(to_thread.run_sync(self._update, block))
 
-    def _hash(self, block: bytes) -> None:
+    def _update(self, block: bytes) -> None:
         if self._sha256 is not None:
             self._sha256.update(block)
         self._digests.update(block)
+
+    async def _write(self, received: int) -> None:
+        """Write the blocks that are held while others arrive."""
+        if self._writing is not None:
+            await self._writing
+            self._writing = None
+        if self._blocks:
+            blocks, self._blocks, self._handed = self._blocks, [], received
+            self._writing = asyncio.ensure_future(to_thread.run_sync(self._writer.write, blocks))
+
+    async def _settle(self) -> None:
+        """Wait for what is under way."""
+        for task in (self._writing, self._hashing):
+            if task is not None:
+                await task
 
     async def _seal(self) -> None:
         shared = self._shared

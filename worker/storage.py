@@ -27,12 +27,14 @@ from obstore.exceptions import BaseError
 from obstore.store import from_url
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterable, AsyncIterator, Iterator
+    from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
 
 PART_BYTES = 8 << 20
 PARTS_AT_ONCE = 3
 """Of an upload that arrives faster than it can be written: this bounds its memory."""
 CHUNK_BYTES = 1 << 20
+SYNC_BYTES = 32 << 20
+"""After so many bytes a growing local file is synced, beside the arrival of more."""
 
 _KEY = re.compile(r"(?!.*(?:^|/)\.{1,2}(?:/|$))[A-Za-z0-9_.-]+(?:/[A-Za-z0-9_.-]+)*")
 
@@ -231,7 +233,7 @@ class ObjectStorage:
         """Return the number of bytes of an open file."""
         return os.fstat(descriptor).st_size
 
-    def write_at(self, descriptor: int, data: bytes, offset: int) -> None:
+    def write_at(self, descriptor: int, blocks: Iterable[bytes], offset: int) -> None:
         """Write bytes at an offset of an open file, so that they outlast a power cut.
 
         Raises
@@ -239,11 +241,12 @@ class ObjectStorage:
         StorageError
         """
         with _failures("an upload"):
-            left = memoryview(data)
-            while left:
-                count = os.pwrite(descriptor, left, offset)
-                offset += count
-                left = left[count:]
+            for block in blocks:
+                left = memoryview(block)
+                while left:
+                    count = os.pwrite(descriptor, left, offset)
+                    offset += count
+                    left = left[count:]
             os.fdatasync(descriptor)
 
     def cut(self, key: str, length: int) -> None:
@@ -510,11 +513,20 @@ async def _write_file(target: Path, meter: _Meter, chunks: AsyncIterable[bytes])
     with staged.open("xb", buffering=0) as file:
         guard = threading.Lock()  # held by a thread that writes, which a cancelled task leaves
 
+        unsynced = 0
+
         def write(block: bytes) -> None:
+            nonlocal unsynced
             with guard:
                 left = memoryview(block)
                 while left and not file.closed:
                     left = left[file.write(left) :]
+                unsynced += len(block)
+                if (
+                    unsynced >= SYNC_BYTES and not file.closed
+                ):  # a little work often, none to wait for
+                    os.fdatasync(file.fileno())
+                    unsynced = 0
 
         try:
             writing: asyncio.Future[Any] | None = None

@@ -436,23 +436,23 @@ class UploadWriter:
                 self._store.rewind(self._upload, self._token, size)
                 raise OffsetMismatch(self._upload.id)
 
-    def write(self, block: bytes) -> None:
+    def write(self, blocks: Sequence[bytes]) -> None:
         """Store the next bytes.
 
         Raises
         ------
         UploadSuperseded, StorageError
         """
-        end = self._written + len(block)
+        end = self._written + sum(map(len, blocks))
         if self._storage.folder is not None:
             with self._fenced() as descriptor:
-                self._storage.write_at(descriptor, block, self._written)
+                self._storage.write_at(descriptor, blocks, self._written)
                 self._written = end
                 if not self._deferred:
                     self.commit()
             return
         part = f"{self._upload.prefix}parts/{self._written:016d}-{self._token}"
-        self._storage.put_bytes(part, block)
+        self._storage.put_bytes(part, b"".join(blocks))
         self._parts.append(part)
         self._written = end
         if not self._deferred:
