@@ -10,7 +10,9 @@ What the network or a busy server makes fail is tried again, with growing pauses
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import functools
 import io
 import json
 import os
@@ -56,6 +58,11 @@ _REFUSALS: Final = frozenset(
 )
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.25, 10.0
 _CHUNK = 1 << 20
+_TUS: Final = {"Tus-Resumable": "1.0.0"}
+_STALLS = 8
+"""How often an upload may be tried without any byte more."""
+RESUMABLE_BYTES: Final = 64 << 20
+"""Size of files from which on a broken upload is gone on with."""
 
 
 class ClientError(Exception):
@@ -189,11 +196,12 @@ class Client:
         faces: AnyPath | None = None,
         options: Mapping[str, object] | None = None,
         progress: Transferred | None = None,
+        resumable: int = RESUMABLE_BYTES,
     ) -> Job:
         """Upload files and start a job.
 
-        Files are streamed. Where an answer is lost after the upload, the upload is repeated, and
-        the server may then hold the job twice.
+        Files are streamed. Those of `resumable` bytes and more together go over by the tus protocol
+        (`upload`): after a broken connection the upload goes on where it stood.
 
         Parameters
         ----------
@@ -205,6 +213,8 @@ class Client:
             Names and values of options.
         progress : callable, optional
             Called while the files go over.
+        resumable : int
+            Size of all files from which on a broken upload is gone on with, not begun again.
 
         Raises
         ------
@@ -217,6 +227,8 @@ class Client:
         """
         paths = {"measurements": measurements, "ground_truth": ground_truth, "faces": faces}
         given = {role: Path(path) for role, path in paths.items() if path is not None}
+        if sum(path.stat().st_size for path in given.values()) >= resumable:
+            return self._submit_uploads(given, options, progress)
         with contextlib.ExitStack() as stack:
             counter = _Counter(sum(path.stat().st_size for path in given.values()), progress)
             files = {
@@ -233,6 +245,96 @@ class Client:
                 return self._http.post("/v1/jobs", data=data, files=files)
 
             return Job.model_validate(self._insist(send).json())
+
+    def _submit_uploads(
+        self,
+        files: Mapping[str, Path],
+        options: Mapping[str, object] | None,
+        progress: Transferred | None,
+    ) -> Job:
+        counter = _Counter(sum(path.stat().st_size for path in files.values()), progress)
+        counter.restart()
+        document: dict[str, object] = {"options": dict(options or {})}
+        for role, path in files.items():
+            document[role] = {"upload": self._upload(path, role, counter)}
+        send = functools.partial(self._http.post, "/v1/jobs", json=document)
+        return Job.model_validate(self._insist(send).json())
+
+    def upload(self, path: AnyPath, *, progress: Transferred | None = None) -> str:
+        """Upload a file by the tus protocol, over a network that breaks as well.
+
+        Parameters
+        ----------
+        path : path
+        progress : callable, optional
+            Called while the file goes over.
+
+        Returns
+        -------
+        str
+            Id of the upload, of which a job can be made.
+
+        Raises
+        ------
+        ServiceError
+            The server refused the file.
+        ServerUnreachable
+            No answer, or no progress any more.
+        OSError
+            The file cannot be read.
+        """
+        path = Path(path)
+        counter = _Counter(path.stat().st_size, progress)
+        counter.restart()
+        return self._upload(path, "", counter)
+
+    def _upload(self, path: Path, role: str, counter: _Counter) -> str:
+        told = {"filename": path.name} | ({"role": role} if role else {})
+        metadata = ",".join(
+            f"{name} {base64.b64encode(text.encode()).decode()}" for name, text in told.items()
+        )
+        size = path.stat().st_size
+        headers = _TUS | {"Upload-Length": str(size), "Upload-Metadata": metadata}
+        created = self._request("POST", "/v1/uploads", headers=headers)
+        upload_id = created.headers["location"].rpartition("/")[2]
+        url = f"/v1/uploads/{upload_id}"
+        before = counter.done
+        offset = 0
+        with _Reader(path, counter) as file:
+
+            def send() -> httpx.Response:
+                return self._http.patch(
+                    url,
+                    content=iter(functools.partial(file.read, _CHUNK), b""),
+                    headers=_TUS
+                    | {
+                        "Content-Type": "application/offset+octet-stream",
+                        "Content-Length": str(size - offset),
+                        "Upload-Offset": str(offset),
+                    },
+                )
+
+            stalls = 0
+            while offset < size:
+                counter.to(before + offset)
+                file.seek(offset)
+                try:
+                    answer = send()
+                except httpx.TransportError:
+                    pass
+                else:
+                    behind = answer.status_code == HTTPStatus.CONFLICT
+                    if answer.is_error and not behind and answer.status_code not in _TRY_AGAIN:
+                        raise _service_error(answer)
+                reached = int(self._request("HEAD", url, headers=_TUS).headers["upload-offset"])
+                stalls = 0 if reached > offset else stalls + 1
+                if stalls > _STALLS:
+                    raise ServerUnreachable(f"The upload of {path.name} does not go on.")
+                if stalls:
+                    time.sleep(min(_FIRST_PAUSE * 2**stalls, _LONGEST_PAUSE))
+                offset = reached
+            counter.to(before + size)
+        return upload_id
 
     def get(self, job_id: str, *, wait: float = 0) -> Job:
         """Return a job.
@@ -407,6 +509,15 @@ class _Counter:
 
     def restart(self) -> None:
         self._done = 0
+        self.add(0)
+
+    @property
+    def done(self) -> int:
+        return self._done
+
+    def to(self, done: int) -> None:
+        """Set what went over, in which a resumed upload goes back."""
+        self._done = done
         self.add(0)
 
     def add(self, count: int) -> None:

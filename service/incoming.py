@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from anyio import CancelScope, to_thread
 from starlette.requests import ClientDisconnect
 
+from service import quotas
 from service.bodies import Body
 from service.digests import BodyDigests
 from service.problems import Problem
@@ -55,6 +56,7 @@ PART_BYTES = 8 << 20
 """What is made safe at once, in a local folder and in a bucket: a killed process loses less."""
 
 ID_LENGTH = 32
+_HOLD_MARGIN_SECONDS = 60.0
 
 
 def limits_of(shared: Context) -> UploadLimits:
@@ -112,6 +114,12 @@ async def discard(shared: Context, folder: str) -> None:
         await to_thread.run_sync(shared.storage.delete_prefix, folder_prefix(folder))
 
 
+async def hold(shared: Context, upload: Upload) -> None:
+    """Count the bytes of an upload as its owner's, as long as it is kept."""
+    seconds = shared.uploads.ttl + _HOLD_MARGIN_SECONDS
+    await quotas.hold(shared, upload.folder, upload.length, seconds)
+
+
 async def receive_whole(request: Request, shared: Context, upload: Upload) -> bool:
     """Store the body of a PUT as an upload; return whether there was none of this id.
 
@@ -160,6 +168,7 @@ async def receive_whole(request: Request, shared: Context, upload: Upload) -> bo
             key=stored.key,
             sha256=stored.sha256,
         )
+        await hold(shared, whole)
         created, former = await to_thread.run_sync(store.replace, whole)
     except BaseException as error:
         # Shielded: a cancelled request cleans up as well.
@@ -169,6 +178,7 @@ async def receive_whole(request: Request, shared: Context, upload: Upload) -> bo
             raise _used(upload.id) from None
         raise
     if former is not None:
+        await quotas.drop(shared, former)
         await discard(shared, former)
     return created
 
@@ -195,6 +205,7 @@ async def receive_piece(request: Request, shared: Context, upload: Upload, offse
         raise _too_long(upload)
     digests = BodyDigests.of(request.headers, tus=True)
     try:
+        await hold(shared, upload)
         token = await to_thread.run_sync(shared.uploads.begin, upload, offset)
         piece = _Piece(shared, upload, offset, token, digests)
         return await piece.receive(Body(request, limits_of(shared).idle_seconds))
@@ -237,6 +248,7 @@ async def remove(shared: Context, upload_id: str) -> bool:
     if folder is None:
         return False
     shared.digests.forget(folder)
+    await quotas.drop(shared, folder)
     await discard(shared, folder)
     return True
 
@@ -396,7 +408,8 @@ async def receive_references(request: Request, job_id: str, shared: Context) -> 
     uploads = {role: await finish(shared, await find(shared, id_)) for role, id_ in ids.items()}
     frames, points = await _check(shared, uploads, options)
     inputs = await _take(shared, uploads, job_id)
-    return Submission(options, inputs, frames, points, settings, from_uploads=True)
+    folders = {upload.id: upload.folder for upload in uploads.values()}
+    return Submission(options, inputs, frames, points, settings, folders)
 
 
 async def _read_document(request: Request) -> dict[str, Any]:

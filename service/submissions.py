@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -185,8 +186,8 @@ class Submission:
     frames, points : int or None
         T and N, where the beginning of the measurements tells them.
     settings : JobSettings
-    from_uploads : bool
-        Whether the files were uploads on their own, which are not lost with the submission.
+    from_uploads : mapping of str to str
+        Ids and folders of the uploads that the files were, which are not lost with the submission.
     """
 
     options: JobOptions
@@ -194,7 +195,7 @@ class Submission:
     frames: int | None
     points: int | None
     settings: JobSettings = field(default_factory=JobSettings)
-    from_uploads: bool = False
+    from_uploads: Mapping[str, str] = field(default_factory=dict)
 
 
 def digest_of(submission: Submission, owner: str | None) -> str:
@@ -265,14 +266,14 @@ async def accept(
         points=submission.points,
         webhook=settings.webhook,
     )
+    held = (*uploads, *submission.from_uploads.values())
     reuse = shared.settings.reuse_results if settings.reuse is None else settings.reuse
     try:
         return await to_thread.run_sync(
-            partial(shared.queue.submit, record, shared.allowance, uploads, reuse=reuse)
+            partial(shared.queue.submit, record, shared.allowance, held, reuse=reuse)
         )
     except (TooManyJobs, TooManyBytes):
-        if not submission.from_uploads:
-            await discard_uploads(shared.storage, record.id)
+        await _undo(shared, record.id, submission)
         raise
     except RedisError:
         # A record without a place in the queue gets one by maintenance: it is accepted. Where not
@@ -280,8 +281,7 @@ async def accept(
         accepted = await to_thread.run_sync(shared.queue.records.get, record.id)
         if accepted is not None:
             return accepted
-        if not submission.from_uploads:
-            await discard_uploads(shared.storage, record.id)
+        await _undo(shared, record.id, submission)
         raise
 
 
@@ -299,6 +299,16 @@ async def check_webhook(operator: Settings, settings: JobSettings) -> None:
             setting="webhook",
             settings=list(SETTINGS),
         ) from None
+
+
+async def _undo(shared: Context, job_id: str, submission: Submission) -> None:
+    """Remove the files of a job that will not be, or make them uploads again."""
+    if not submission.from_uploads:
+        await discard_uploads(shared.storage, job_id)
+        return
+    with suppress(RedisError):  # without Redis they are given back when they are asked for
+        ids = list(submission.from_uploads)
+        await to_thread.run_sync(shared.uploads.give_back, shared.owner, ids, job_id)
 
 
 async def discard_uploads(storage: ObjectStorage, job_id: str) -> None:

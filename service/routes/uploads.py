@@ -13,11 +13,13 @@ from multipart import parse_options_header
 from starlette.datastructures import MutableHeaders
 from starlette.requests import ClientDisconnect
 
+from service import quotas
 from service.context import Context, Shared, root_of
 from service.digests import CHECKSUMS
 from service.incoming import (
     check_head,
     find,
+    hold,
     is_id,
     limits_of,
     receive_piece,
@@ -172,6 +174,7 @@ async def create_upload(request: Request, shared: Shared) -> Response:
     with_piece = "content-type" in request.headers and _has_body(request)
     if with_piece:
         _check_type(request)
+    await hold(shared, upload)
     await to_thread.run_sync(shared.uploads.create, upload)
     if with_piece:
         try:
@@ -356,7 +359,8 @@ async def put_upload(
         length=0,
     )
     try:
-        created = await receive_whole(request, shared, upload)
+        async with quotas.room(shared, request, upload.folder) as body:
+            created = await receive_whole(body, shared, upload)
     except ClientDisconnect:
         raise _gone() from None
     document = upload_document(await find(shared, upload_id), root=root_of(request))

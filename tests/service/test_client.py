@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import io
 import json
 import socket
@@ -254,3 +256,81 @@ def test_an_answer_that_is_no_problem_document_is_still_told(moody: _Moody) -> N
     moody.answers = [lambda handler: answer(handler, 404, ["nothing"])]
     with _client(moody) as client, pytest.raises(ServiceError, match="404"):
         client.info()
+
+
+class _Breaking(threading.Thread):
+    """A way to a server that breaks off after so many bytes, as often as it is told."""
+
+    def __init__(self, url: str, after: int, times: int) -> None:
+        super().__init__(daemon=True)
+        host, port = url.rpartition("/")[2].split(":")
+        self._target = (host, int(port))
+        self._after, self._left = after, times
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        self.broken = 0
+
+    def run(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._carry, args=(client,), daemon=True).start()
+
+    def _carry(self, client: socket.socket) -> None:
+        server = socket.create_connection(self._target)
+
+        def back() -> None:
+            with contextlib.suppress(OSError):  # broken off meanwhile
+                while data := server.recv(65536):
+                    client.sendall(data)
+            client.close()
+
+        threading.Thread(target=back, daemon=True).start()
+        carried = 0
+        while data := client.recv(65536):
+            server.sendall(data)
+            carried += len(data)
+            if carried > self._after and self._left > 0:
+                self._left -= 1
+                self.broken += 1
+                break
+        server.shutdown(socket.SHUT_WR)
+        server.close()
+        client.close()
+
+    def stop(self) -> None:
+        self._listener.close()
+
+
+def test_a_large_file_gets_over_a_network_that_breaks(served: Served, tmp_path: Path) -> None:
+    tracks = np.random.default_rng(0).standard_normal((60, 20_000))
+    np.save(tmp_path / "w.npy", tracks)
+    size = (tmp_path / "w.npy").stat().st_size
+    way = _Breaking(served.url, 3_000_000, times=2)
+    way.start()
+    seen: list[tuple[int, int]] = []
+    with Client(way.url, patience=20) as client:
+        job = client.submit(
+            tmp_path / "w.npy",
+            options={"layout": "interleaved"},
+            progress=lambda done, total: seen.append((done, total)),
+            resumable=1,
+        )
+        assert (
+            job.inputs["measurements"].sha256
+            == hashlib.sha256((tmp_path / "w.npy").read_bytes()).hexdigest()
+        )
+        assert (job.frames, job.points) == (30, 20_000)
+        client.delete(job.id)
+    way.stop()
+    assert way.broken == 2
+    assert (seen[0], seen[-1]) == ((0, size), (size, size))
+
+
+def test_a_large_file_that_is_refused(client: Client, tmp_path: Path) -> None:
+    np.save(tmp_path / "odd.npy", np.ones((7, 10_000)))
+    with pytest.raises(ServiceError) as caught:
+        client.submit(tmp_path / "odd.npy", resumable=1)
+    assert caught.value.slug == "odd-row-count"

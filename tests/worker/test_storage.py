@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from worker.storage import ObjectMissing, ObjectStorage, StorageError, UploadTooLarge
+from worker.storage import (
+    ObjectMissing,
+    ObjectStorage,
+    StorageError,
+    StorageFull,
+    UploadTooLarge,
+)
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -222,3 +228,17 @@ def test_a_failing_storage_says_so(folder: ObjectStorage) -> None:
         folder.put_bytes("uploads/a/m", b"x")
     with pytest.raises(StorageError):
         asyncio.run(folder.put_stream("uploads/a/m", chunks(b"x")))
+
+
+def test_a_full_disk_is_told_from_other_failures(folder: ObjectStorage) -> None:
+    with Path("/dev/full").open("wb", buffering=0) as full, pytest.raises(StorageFull):
+        folder.write_at(full.fileno(), [b"x"], 0)
+
+
+def test_an_object_moves_once_and_again(storage: ObjectStorage) -> None:
+    storage.put_bytes("uploads/a/x", b"moved")
+    for _ in range(2):
+        storage.move("uploads/a/x", "uploads/b/y")
+        assert keys(storage) == ["uploads/b/y"]
+    with pytest.raises(ObjectMissing):
+        storage.move("uploads/a/x", "uploads/c/y")
