@@ -429,6 +429,9 @@ class Client:
     ) -> Path:
         """Fetch a result into a file, which appears whole or not at all.
 
+        Where the connection breaks, the download goes on with what is missing, unless the job has
+        been run again meanwhile.
+
         Parameters
         ----------
         job_id : str
@@ -449,15 +452,35 @@ class Client:
         target.parent.mkdir(parents=True, exist_ok=True)
         part = target.with_name(target.name + ".part")
         url = f"/v1/jobs/{job_id}/{what}"
+        tag = ""
 
         def fetch() -> httpx.Response:
-            with self._http.stream("GET", url, headers={"Accept": "*/*"}) as response:
+            nonlocal tag
+            # Bytes of a range count as they are sent, so no coding may be laid over them.
+            headers = {"Accept": "*/*", "Accept-Encoding": "identity"}
+            held = part.stat().st_size if tag and part.exists() else 0
+            if held:
+                headers |= {"Range": f"bytes={held}-", "If-Range": tag}
+            # The service may send to the storage itself for a file.
+            with self._http.stream("GET", url, headers=headers, follow_redirects=True) as response:
+                partial = response.status_code == HTTPStatus.PARTIAL_CONTENT
+                former, tag = tag, _strong_tag(response)
+                if held and (response.is_client_error or (partial and tag != former)):
+                    # Nothing of this file can be added to what is there: begin again.
+                    part.unlink()
+                    raise httpx.ReadError("the file has changed")
                 if response.is_error:
+                    tag = former
                     response.read()
                     return response
-                counter = _Counter(int(response.headers.get("content-length", 0)), progress)
-                with part.open("wb") as file:
-                    for chunk in response.iter_bytes(_CHUNK):
+                if not partial:
+                    held = 0
+                length = int(response.headers.get("content-length", 0))
+                counter = _Counter(held + length if length else 0, progress)
+                counter.add(held)
+                with part.open("ab" if held else "wb", buffering=0) as file:
+                    # As they arrive: what is collected is lost when the connection breaks.
+                    for chunk in response.iter_bytes():
                         file.write(chunk)
                         counter.add(len(chunk))
                 return response
@@ -537,6 +560,13 @@ class _Reader(io.FileIO):
         data = super().read(-1 if size is None else size) or b""
         self._counter.add(len(data))
         return data
+
+
+def _strong_tag(response: httpx.Response) -> str:
+    """Return the entity tag where the file can be asked for in parts, otherwise nothing."""
+    tag = str(response.headers.get("etag", ""))
+    in_parts = response.headers.get("accept-ranges") == "bytes"
+    return tag if in_parts and not tag.startswith("W/") else ""
 
 
 def _retry_after(response: httpx.Response) -> float:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import httpx
 import pytest
 import redis
 
@@ -157,3 +160,59 @@ def redis_url(redis_process: RedisProcess) -> str:
     """Address of an empty Redis server."""
     redis_process.client().flushall()
     return redis_process.url
+
+
+@dataclass(frozen=True)
+class S3Process:
+    """A real S3 server of the tests, which keeps objects in memory."""
+
+    url: str
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What a process needs to reach it."""
+        return {
+            "AWS_ENDPOINT_URL": self.url,
+            "AWS_ALLOW_HTTP": "true",
+            "AWS_REGION": "us-east-1",
+            "AWS_ACCESS_KEY_ID": "smsr-test",
+            "AWS_SECRET_ACCESS_KEY": "smsr-test",
+        }
+
+    def new_bucket(self) -> str:
+        """Make a bucket and return its address."""
+        name = f"smsr-{uuid.uuid4().hex}"
+        httpx.put(f"{self.url}/{name}").raise_for_status()
+        return f"s3://{name}/prefix"
+
+
+@contextlib.contextmanager
+def s3_running(folder: Path) -> Iterator[S3Process]:
+    """Run an S3 server until the block ends."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    log = folder / "s3.log"
+    with (
+        log.open("w") as output,
+        subprocess.Popen(command, stdout=output, stderr=output) as process,
+    ):
+        try:
+            for _ in range(1200):
+                assert process.poll() is None, log.read_text()
+                with contextlib.suppress(httpx.TransportError):
+                    httpx.get(f"http://127.0.0.1:{port}/")
+                    break
+                time.sleep(0.05)
+            else:
+                raise AssertionError(log.read_text())
+            yield S3Process(f"http://127.0.0.1:{port}")
+        finally:
+            process.kill()  # it would wait for connections that are kept open
+
+
+@pytest.fixture(scope="session")
+def s3_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[S3Process]:
+    with s3_running(tmp_path_factory.mktemp("s3")) as server:
+        yield server

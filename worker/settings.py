@@ -54,6 +54,14 @@ class Settings(BaseSettings):
         " Results move into file:// storage without a copy where both share a file system.",
     )
 
+    presigned_links_seconds: int | None = Field(
+        default=None,
+        ge=1,
+        le=7 * DAY,
+        description="Where set and results are in S3, arrays are not passed through the API: it "
+        "redirects to signed addresses of the store that are good for so long.",
+    )
+
     max_upload_bytes: int = Field(default=4 * GIBIBYTE, gt=0, description="Largest upload.")
     max_array_bytes: int = Field(
         default=16 * GIBIBYTE, gt=0, description="Largest array, decompressed."

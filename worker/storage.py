@@ -17,8 +17,9 @@ import shutil
 import threading
 import uuid
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
@@ -28,6 +29,8 @@ from obstore.store import from_url
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
+
+    from obstore.store import S3Store
 
 PART_BYTES = 8 << 20
 PARTS_AT_ONCE = 3
@@ -377,6 +380,30 @@ class ObjectStorage:
             )
             async for chunk in found.stream(min_chunk_size=chunk_bytes):
                 yield bytes(chunk)
+
+    def sign(self, key: str, seconds: float) -> str | None:
+        """Return an address from which anybody can get an object for a while.
+
+        Parameters
+        ----------
+        key : str
+        seconds : float
+            How long the address is good.
+
+        Returns
+        -------
+        str or None
+            None where the storage is a folder, which has no address.
+
+        Raises
+        ------
+        StorageError
+        """
+        if self.folder is not None:
+            return None
+        with _failures(key):
+            store = cast("S3Store", self._store)
+            return obstore.sign(store, "GET", _checked(key), timedelta(seconds=seconds))
 
     def open_local(self, key: str, scratch: Path) -> Path:
         """Return a local file with an object's bytes, to be read only.

@@ -1,11 +1,12 @@
 """Downloading results."""
 
 from enum import StrEnum
+from http import HTTPStatus
 from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Path, Query
-from starlette.responses import StreamingResponse
+from fastapi import APIRouter, Path, Query, Request
+from starlette.responses import RedirectResponse, Response, StreamingResponse
 
 from service.conditional import Validators
 from service.content import stored_content
@@ -198,20 +199,30 @@ class ArrayName(StrEnum):
     response_class=StreamingResponse,
     responses={
         200: _binary("application/octet-stream", "Read it with numpy.load."),
+        307: {"description": "To a signed address of the store, where the operator wants that."},
         **_PROBLEMS,
         **example_responses("unknown-job", "unknown-file", "invalid-request"),
     },
 )
-async def get_array(shared: Shared, job_id: JobId, array: ArrayName) -> Download:
+async def get_array(request: Request, shared: Shared, job_id: JobId, array: ArrayName) -> Response:
     """Return an array as an NPY file, or the range of its bytes that is asked for.
 
     `shapes` is float32 (T, N, 3), `cameras` float64 (T, 2, 3), `translations` float64 (T, 2) and
     `faces`, where some were sent, (F, 3). A reader that knows the header can fetch single frames.
     """
     files = await _open(shared, job_id)
-    if f"{array}.npy" not in files.arrays():
+    file = f"{array}.npy"
+    found = files.arrays().get(file)
+    if found is None:
         raise Problem("unknown-file", "No faces were sent with the job, so its result has none.")
-    return files.array(f"{array}.npy", f"smsr-{job_id}-{array}.npy")
+    seconds = shared.settings.presigned_links_seconds
+    # A signature is for one method, and HEAD moves no bytes.
+    if seconds is not None and request.method == "GET":
+        address = await to_thread.run_sync(shared.storage.sign, found.key, seconds)
+        if address is not None:
+            headers = {"Cache-Control": "no-store"}
+            return RedirectResponse(address, HTTPStatus.TEMPORARY_REDIRECT, headers)
+    return files.array(file, f"smsr-{job_id}-{file}")
 
 
 @router.get(

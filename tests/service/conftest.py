@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
+import itertools
 import json
 import os
 import shutil
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tests.conftest import S3Process
+
 Files = dict[str, tuple[str, bytes]]
 
 UPLOAD_LIMIT = 32 << 20
@@ -45,6 +49,22 @@ def npy(array: NDArray[Any]) -> bytes:
     return buffer.getvalue()
 
 
+class InTurn(httpx.BaseTransport):
+    """Sends each request to the next of several servers, as a load balancer does."""
+
+    def __init__(self, servers: list[str]) -> None:
+        self._servers = itertools.cycle([httpx.URL(server) for server in servers])
+        self._network = httpx.HTTPTransport()
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        server = next(self._servers)
+        request.url = request.url.copy_with(host=server.host, port=server.port)
+        return self._network.handle_request(request)
+
+    def close(self) -> None:
+        self._network.close()
+
+
 @dataclass(frozen=True)
 class Api:
     """A running API process, and what it writes to."""
@@ -54,12 +74,20 @@ class Api:
     settings: Settings
     redis: RedisProcess
     log: Path
+    others: tuple[str, ...] = ()
+    """Addresses of further API processes of the same cluster."""
 
     @property
     def objects(self) -> Path:
+        """Folder of the storage; a test that looks into it cannot run on a bucket."""
+        if self.settings.storage_url is not None:
+            pytest.skip("the storage of this cluster is no folder")
         return self.settings.data_dir / "objects"
 
     def client(self, **more: Any) -> httpx.Client:
+        """A client; of a cluster each request goes to another API process."""
+        if self.others and "transport" not in more:
+            more["transport"] = InTurn([self.url, *self.others])
         return httpx.Client(base_url=self.url, timeout=60, **more)
 
     def storage(self) -> ObjectStorage:
@@ -68,6 +96,10 @@ class Api:
 
     def stored(self) -> set[str]:
         """Paths of all files in the storage."""
+        if self.settings.storage_url is not None:
+            storage = self.storage()
+            prefixes = ("uploads/", "incoming/", "results/")
+            return {item.key for prefix in prefixes for item in storage.list_prefix(prefix)}
         return {str(path) for path in self.objects.rglob("*") if path.is_file()}
 
     def left_behind(self) -> set[str]:
@@ -152,12 +184,33 @@ def api_redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RedisProcess
 
 
 @pytest.fixture(scope="session")
-def api(tmp_path_factory: pytest.TempPathFactory, api_redis: RedisProcess) -> Iterator[Api]:
-    """An API and one worker, shared by all tests that break neither."""
+def api(
+    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+    api_redis: RedisProcess,
+) -> Iterator[Api]:
+    """An API and one worker, shared by all tests that break neither.
+
+    With SMSR_TEST_CLUSTER=s3: two API processes and three workers on one Redis and one bucket.
+    """
     folder = tmp_path_factory.mktemp("api")
-    settings = settings_for(folder, api_redis)
-    with WorkerPool(settings, 1), api_running(settings, api_redis, folder / "api.log") as running:
-        yield running
+    log = folder / "api.log"
+    if os.environ.get("SMSR_TEST_CLUSTER") != "s3":
+        settings = settings_for(folder, api_redis)
+        with WorkerPool(settings, 1), api_running(settings, api_redis, log) as running:
+            yield running
+        return
+    s3: S3Process = request.getfixturevalue("s3_process")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in s3.environment.items():
+            patch.setenv(name, value)
+        settings = settings_for(folder, api_redis, storage_url=s3.new_bucket(), workers=3)
+        with (
+            WorkerPool(settings, 3),
+            api_running(settings, api_redis, log) as first,
+            api_running(settings, api_redis, log) as second,
+        ):
+            yield dataclasses.replace(first, others=(second.url,))
 
 
 @pytest.fixture

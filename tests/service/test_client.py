@@ -10,6 +10,7 @@ import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -71,6 +72,55 @@ def test_downloads_are_whole(client: Client, finished: Job, tmp_path: Path) -> N
         assert arrays["cameras"].shape == (20, 2, 3)
     assert seen[-1] == (target.stat().st_size, target.stat().st_size)
     assert [path.name for path in target.parent.iterdir()] == ["result.npz"]
+
+
+class Breaking(httpx.BaseTransport):
+    """A network that breaks every answer off after some bytes, and notes what was asked for."""
+
+    def __init__(self, after: int) -> None:
+        self.after = after
+        self.ranges: list[str | None] = []
+        self._network = httpx.HTTPTransport()
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        self.ranges.append(request.headers.get("range"))
+        answer = self._network.handle_request(request)
+        body = answer.read()
+        stream = Broken(body, self.after) if len(body) > self.after else httpx.ByteStream(body)
+        return httpx.Response(answer.status_code, headers=answer.headers, stream=stream)
+
+
+class Broken(httpx.SyncByteStream):
+    def __init__(self, body: bytes, after: int) -> None:
+        self.body, self.after = body, after
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield self.body[: self.after]
+        raise httpx.ReadError("the connection broke")
+
+
+@pytest.mark.parametrize("what", ["result.npz", "frames.zip", "shapes.npy"])
+def test_a_download_goes_on_where_it_broke(
+    client: Client, served: Served, finished: Job, tmp_path: Path, what: str
+) -> None:
+    whole = client.download(finished.id, what, tmp_path / "whole").read_bytes()
+    after = len(whole) // 3
+    network = Breaking(after + 1)
+    seen: list[tuple[int, int]] = []
+    with Client(served.url, transport=network) as broken:
+        target = broken.download(
+            finished.id, what, tmp_path / what, progress=lambda *now: seen.append(now)
+        )
+    assert target.read_bytes() == whole
+    # Each request asks for what is missing only.
+    assert network.ranges[0] is None
+    assert len(network.ranges) > 1
+    assert seen[-1] == (len(whole), len(whole))
+    starts = [
+        int(found.removeprefix("bytes=").rstrip("-")) for found in network.ranges[1:] if found
+    ]
+    assert starts == sorted(set(starts))
+    assert starts[0] > 0
 
 
 def test_a_refused_download_leaves_no_file(client: Client, finished: Job, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import httpx
 import numpy as np
 import pytest
 
+from service.client import Client
 from service.downloads import disposition, safe_media_type
 from tests.conftest import redis_running
 from tests.service.conftest import (
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smsr.synthetic import Example
+    from tests.conftest import S3Process
 
 
 @pytest.fixture(scope="module")
@@ -160,8 +162,10 @@ def test_a_job_that_failed_for_its_input_has_none_to_give(client: httpx.Client) 
     constant = npy(np.ones((12, 6), np.float32))
     failed = finished(client, submit(client, {"measurements": ("w.npy", constant)}))
     assert failed["status"] == "failed"
-    answer = client.get(failed["inputs"]["measurements"]["link"])
-    problem(answer, "unknown-file", 404)
+    link = failed["inputs"]["measurements"]["link"]
+    # The worker removes them after it has said that the job failed.
+    wait_for(lambda: client.head(link).status_code == 404)
+    problem(client.get(link), "unknown-file", 404)
 
 
 def test_names_cannot_break_out_of_their_header() -> None:
@@ -321,3 +325,36 @@ def test_curl_goes_on_where_it_was_killed_though_the_service_was_restarted(
 
 def has_bytes(path: Path, least: int) -> bool:
     return path.exists() and path.stat().st_size > least
+
+
+def test_arrays_come_from_the_store_itself_where_that_is_wanted(
+    tmp_path: Path, s3_process: S3Process, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in s3_process.environment.items():
+        monkeypatch.setenv(name, value)
+    bucket = s3_process.new_bucket()
+    with redis_running(tmp_path) as redis:
+        settings = settings_for(tmp_path, redis, storage_url=bucket, presigned_links_seconds=60)
+        with api_running(settings, redis, tmp_path / "api.log") as api:
+            shapes = np.random.default_rng(0).normal(size=(5, 7, 3)).astype("<f4")
+            job_id = publish_result(
+                api,
+                {
+                    "shapes.npy": shapes,
+                    "cameras.npy": np.zeros((5, 2, 3)),
+                    "translations.npy": np.zeros((5, 2)),
+                    "faces.npy": np.zeros((2, 3), np.int64),
+                },
+            )
+            path = f"/v1/jobs/{job_id}/shapes.npy"
+            sent = httpx.get(api.url + path, headers={"Range": "bytes=0-9"})
+            assert (sent.status_code, sent.headers["cache-control"]) == (307, "no-store")
+            assert sent.headers["location"].startswith(s3_process.url)
+            stored = httpx.get(sent.headers["location"], headers={"Range": "bytes=128-139"})
+            assert (stored.status_code, stored.content) == (206, shapes.tobytes()[:12])
+            assert httpx.head(api.url + path).status_code == 200
+            with Client(api.url) as client:
+                found = client.download(job_id, "shapes.npy", tmp_path / "shapes.npy")
+                np.testing.assert_array_equal(np.load(found), shapes)
+                archive = client.download(job_id, "result.npz", tmp_path / "result.npz")
+                np.testing.assert_array_equal(np.load(archive)["shapes"], shapes)

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import httpx
 import pytest
 
 from worker.storage import (
@@ -19,20 +20,37 @@ from worker.storage import (
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
+    from tests.conftest import S3Process
+
 
 @pytest.fixture(params=["file", "s3"])
 def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ObjectStorage]:
-    """Storage of each kind; a bucket is used where one is given (with AWS_* variables)."""
+    """Storage of each kind; SMSR_TEST_S3_URL names a bucket in place of the tests' own server's."""
     if request.param == "file":
         yield ObjectStorage(tmp_path.joinpath("objects").as_uri())
         return
     bucket = os.environ.get("SMSR_TEST_S3_URL")
-    if not bucket:
-        pytest.skip("SMSR_TEST_S3_URL names no bucket")
-    found = ObjectStorage(f"{bucket}/{tmp_path.name}")
-    yield found
-    for prefix in ("uploads/", "results/", "probes/"):
-        found.delete_prefix(prefix)
+    if bucket:
+        found = ObjectStorage(f"{bucket}/{tmp_path.name}")
+        yield found
+        for prefix in ("uploads/", "results/", "probes/"):
+            found.delete_prefix(prefix)
+        return
+    server: S3Process = request.getfixturevalue("s3_process")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in server.environment.items():
+            patch.setenv(name, value)
+        yield ObjectStorage(server.new_bucket())
+
+
+def test_signed_addresses_are_open_to_anybody_for_a_while(storage: ObjectStorage) -> None:
+    storage.put_bytes("results/a/1/shapes.npy", b"shapes")
+    address = storage.sign("results/a/1/shapes.npy", 60)
+    assert (address is None) == (storage.folder is not None)
+    if address is not None:
+        answer = httpx.get(address, headers={"Range": "bytes=2-3"})
+        assert (answer.status_code, answer.content) == (206, b"ap")
+        assert "X-Amz-Expires=60" in address
 
 
 @pytest.fixture
