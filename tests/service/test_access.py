@@ -1,8 +1,14 @@
 from __future__ import annotations
 
+import asyncio
+import base64
 import contextlib
+import hashlib
+import json
 import re
 import shutil
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -15,13 +21,17 @@ from starlette.routing import Mount
 
 from service.access import PUBLIC, policy_for
 from service.app import create_app
-from tests.conftest import redis_running
+from service.client import Client
+from tests.conftest import clean_environment, redis_running, serving
 from tests.service.conftest import Api, api_running, npy, problem, settings_for, submit
 from worker.keys import KeyStore
 from worker.settings import Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from tests.conftest import Served
 
 
 @dataclass(frozen=True)
@@ -375,6 +385,48 @@ def test_an_upload_of_unknown_length_is_limited_too(guarded: Guarded) -> None:
     assert not guarded.api.redis.client().hgetall("smsr:stored")
 
 
+def test_uploads_on_their_own_are_held_until_they_are_a_job(guarded: Guarded) -> None:
+    redis = guarded.api.redis.client()
+    content = npy(np.random.default_rng(0).normal(size=(100, 1000)))
+    size = len(content)
+    tus = {"Tus-Resumable": "1.0.0", "Upload-Length": str(size)}
+
+    def stored() -> int:
+        return int(redis.hget("smsr:stored", "ann") or 0)
+
+    with guarded.client("ann", stored_bytes=2 * size + 1000, jobs=1) as ann:
+        put = f"/v1/uploads/{NEVER}"
+        assert ann.put(put, content=content, params={"name": "t.npy"}).status_code == 201
+        assert ann.put(put, content=content, params={"name": "t.npy"}).status_code == 200
+        first = ann.post("/v1/uploads", headers=tus).headers["Location"]
+        assert stored() == 2 * size
+        problem(ann.post("/v1/uploads", headers=tus), "too-many-bytes", 507)
+        other = "/v1/uploads/" + "e" * 32
+        problem(ann.put(other, content=content), "too-many-bytes", 507)
+        problem(ann.put(other, content=iter([content])), "too-many-bytes", 507)
+        assert stored() == 2 * size
+        assert ann.delete(first).status_code == 204
+        assert stored() == size
+        body = {"measurements": {"upload": NEVER}}
+        job = ann.post("/v1/jobs", json=body)
+        assert job.status_code == 201, job.text
+        assert stored() == size
+        assert not list(redis.scan_iter("smsr:hold:*"))
+        assert ann.delete(job.headers["Location"]).status_code == 204
+        assert stored() == 0
+
+
+def test_uploads_of_a_refused_job_are_not_lost(guarded: Guarded, files: Files) -> None:
+    name, content = files["measurements"]
+    with guarded.client("ann", stored_bytes=0) as ann, guarded.client("ann", jobs=1) as limited:
+        submit(ann, files)
+        place = "/v1/uploads/" + "e" * 32
+        assert ann.put(place, content=content, params={"name": name}).status_code == 201
+        body = {"measurements": {"upload": "e" * 32}}
+        problem(limited.post("/v1/jobs", json=body), "too-many-jobs", 429)
+        assert ann.post("/v1/jobs", json=body).status_code == 201
+
+
 def test_a_refused_upload_is_held_no_longer(guarded: Guarded) -> None:
     with guarded.client("ann") as ann:
         refused = submit(ann, {"measurements": ("t.npy", npy(np.zeros((5, 9))))})
@@ -428,3 +480,173 @@ def test_what_redis_holds_opens_nothing(guarded: Guarded, files: Files) -> None:
 def test_who_may_come(access: str, address: str | None, policy: str) -> None:
     settings = Settings(redis_url="redis://localhost", access=access)  # type: ignore[arg-type]
     assert policy_for(settings, address) == policy
+
+
+@pytest.fixture(scope="module")
+def local_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """``smsr serve`` on loopback, as it comes."""
+    folder = tmp_path_factory.mktemp("local")
+    with serving(folder, "--workers", "1", environment=clean_environment()) as served:
+        yield served
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example.org"},
+        {"Host": "localhost.evil.example.org"},
+        {"X-Forwarded-For": "203.0.113.7"},
+        {"Forwarded": "for=203.0.113.7"},
+        {"Via": "1.1 proxy"},
+        {"Sec-Fetch-Site": "cross-site", "Origin": "https://evil.example.org"},
+    ],
+)
+def test_on_loopback_only_this_machine_needs_no_key(
+    local_server: Served, headers: dict[str, str]
+) -> None:
+    jobs = f"{local_server.url}/v1/jobs"
+    assert httpx.get(jobs).status_code == 200
+    assert httpx.get(jobs, headers={"Host": "localhost:1234"}).status_code == 200
+    assert httpx.get(jobs, headers={"Authorization": "Basic YTpi"}).status_code == 200
+    problem(httpx.get(jobs, headers=headers), "unauthorized", 401)
+
+
+def smsr(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "service.cli", *arguments],
+        capture_output=True,
+        text=True,
+        env=clean_environment(**environment),
+        timeout=120,
+        check=False,
+    )
+
+
+def test_keys_are_made_while_the_service_runs(local_server: Served) -> None:
+    folder = ("--data-dir", str(local_server.data_dir))
+    made = smsr("keys", "create", "ann", "--note", "x", "--storage", "20GiB", *folder)
+    assert made.returncode == 0, made.stderr
+    key = made.stdout.strip()
+    key_id = key.split("_")[1]
+    assert key_id in made.stderr
+    listed = smsr("keys", "list", "--json", *folder).stdout
+    assert json.loads(listed)[0]["stored_bytes"] == 20 << 30
+    assert key.split("_")[2] not in listed
+    elsewhere = {"Host": "smsr.example.org"}
+    with Client(local_server.url, api_key=key) as client:
+        assert list(client.list()) == []
+    given = httpx.get(
+        f"{local_server.url}/v1/jobs", headers=elsewhere | {"Authorization": f"Bearer {key}"}
+    )
+    assert given.status_code == 200
+    assert smsr("keys", "revoke", key_id, *folder).returncode == 0
+    listing = smsr("jobs", "list", "--server", local_server.url, SMSR_API_KEY=key)
+    assert listing.returncode == 1
+    assert "may have been revoked" in listing.stderr
+    assert smsr("keys", "revoke", key_id, *folder).returncode == 1
+
+
+def test_off_loopback_keys_are_needed_and_it_says_how(tmp_path: Path) -> None:
+    folder = ("--data-dir", str(tmp_path / "data"))
+    key = ""
+    for turn in range(2):
+        with serving(
+            tmp_path, "--workers", "0", "--host", "0.0.0.0", environment=clean_environment()
+        ) as served:
+            problem(httpx.get(f"{served.url}/v1/jobs"), "unauthorized", 401)
+            assert ("smsr keys create" in served.log.read_text()) == (turn == 0)
+            if key:
+                answer = httpx.get(f"{served.url}/v1/jobs", headers={"X-API-Key": key})
+                assert answer.status_code == 200
+        if not key:  # nothing serves the folder now
+            key = smsr("keys", "create", "ann", *folder).stdout.strip()
+
+
+# Headers
+
+
+def check_headers(answer: httpx.Response) -> None:
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert answer.headers["x-frame-options"] == "DENY"
+    policy = answer.headers["content-security-policy"]
+    assert policy.startswith("default-src 'none'")
+    assert "frame-ancestors 'none'" in policy
+    script = re.search(r"script-src ([^;]*)", policy)
+    assert "unsafe" not in (script[1] if script else "")
+    for name in ("x-content-type-options", "content-security-policy", "cache-control"):
+        assert len(answer.headers.get_list(name)) <= 1
+
+
+def test_every_kind_of_answer_has_the_headers(guarded: Guarded, files: Files) -> None:
+    with guarded.client("ann", requests_per_minute=0) as ann, guarded.api.client() as anyone:
+        values = {name: OWNED[name](ann, files) for o in operations() for name in o.owned}
+        statuses = set()
+        for client in (ann, anyone):
+            for operation in operations():
+                answer = ask(client, operation, values)
+                check_headers(answer)
+                statuses.add(answer.status_code)
+                if operation.template.startswith("/v1"):
+                    assert answer.headers["cache-control"], operation
+        assert {200, 401, 404} <= statuses
+        assert ann.get("/v1/jobs").headers["cache-control"] == "no-store"
+        for path in ("/nothing", "/v1/nothing", "/static-offline-docs/swagger-ui.css"):
+            check_headers(ann.get(path))
+
+
+def test_pages_name_their_inline_parts(guarded: Guarded) -> None:
+    with guarded.api.client(headers={"Accept": "text/html"}) as anyone:
+        for path in ("/docs", "/problems", "/problems/internal"):
+            answer = anyone.get(path)
+            check_headers(answer)
+            inline = re.findall(r"<(script|style)>(.*?)</\1>", answer.text, re.DOTALL)
+            assert inline
+            for _, text in inline:
+                digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+                assert f"'sha256-{digest}'" in answer.headers["content-security-policy"]
+
+
+def test_an_unforeseen_error_has_them_too_and_no_trace(redis_url: str) -> None:
+    app = create_app(Settings(redis_url=redis_url, access="open"))
+
+    def broken() -> None:
+        raise RuntimeError("/secret/path")
+
+    app.add_api_route("/v1/broken", broken)
+
+    async def answer() -> httpx.Response:
+        async with app.router.lifespan_context(app):
+            transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+            async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
+                return await client.get("/v1/broken")
+
+    failed = asyncio.run(answer())
+    problem(failed, "internal", 500)
+    check_headers(failed)
+    assert failed.headers["cache-control"] == "no-store"
+    assert "secret" not in failed.text
+
+
+def test_other_origins_are_named_or_refused(guarded: Guarded, idle_api: Api) -> None:
+    asked = {
+        "Access-Control-Request-Method": "PATCH",
+        "Access-Control-Request-Headers": "X-API-Key",
+    }
+    with guarded.api.client() as client:
+        for origin in ("https://app.example.org", "https://b.example.org"):
+            answer = client.options("/v1/jobs", headers={"Origin": origin, **asked})
+            assert answer.status_code == 200
+            assert answer.headers["access-control-allow-origin"] == origin
+            assert "x-api-key" in answer.headers["access-control-allow-headers"].lower()
+            check_headers(answer)
+            # A page must be able to read why it was refused.
+            assert (
+                "access-control-allow-origin"
+                in client.get("/v1/jobs", headers={"Origin": origin}).headers
+            )
+        evil = client.options("/v1/jobs", headers={"Origin": "https://evil.example.org", **asked})
+        assert "access-control-allow-origin" not in evil.headers
+    with idle_api.client() as client:
+        answer = client.get("/v1/jobs", headers={"Origin": "https://app.example.org"})
+        assert not [name for name in answer.headers if name.startswith("access-control")]
