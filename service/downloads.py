@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from starlette.concurrency import iterate_in_threadpool
 from starlette.datastructures import Headers
 from starlette.responses import Response, StreamingResponse
@@ -43,6 +43,8 @@ from service.content import (
     stored_content,
 )
 from service.problems import Problem
+from smsr import figures
+from smsr.figures import FigureSource
 from smsr.files.glb import Bounds, Glb, GlbOptions
 from smsr.files.npy import HEADER_BYTES, parse_header
 from smsr.files.ply import FACE_BYTES, VERTEX_BYTES, ply_face_block, ply_header
@@ -50,11 +52,13 @@ from worker.checksums import CHECKSUMS, FRAME_CHECKSUMS, parse_checksums
 from worker.storage import ObjectMissing
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
     from starlette.types import Receive, Scope, Send
 
+    from smsr.figures import FigureFormat, FigureName
+    from smsr.files.glb import ImageV
     from worker.checksums import FileChecksum
     from worker.records import JobRecord
     from worker.storage import ObjectStorage
@@ -254,54 +258,96 @@ class ResultFiles:
 
         return content
 
-    # Animation
+    # Views
 
-    async def animation(self, options: GlbOptions, name: str) -> Download:
+    def animation(self, options: GlbOptions, name: str) -> Download:
         """Answer with the whole sequence as an animated GLB.
 
-        Raises
-        ------
-        smsr.errors.AnimationTooLarge
-            A GLB cannot hold so much.
+        It is refused with `smsr.errors.AnimationTooLarge` where a GLB cannot hold so much.
         """
-        made = await to_thread.run_sync(self._glb, options)
-        content = Content(
-            made.size, lambda start, stop: iterate_in_threadpool(made.pieces(start, stop))
+
+        async def make() -> Content:
+            made = await to_thread.run_sync(self._glb, options)
+            return Content(
+                made.size, lambda start, stop: iterate_in_threadpool(made.pieces(start, stop))
+            )
+
+        validators = self._validators_of(options)
+        return Download(make, name=name, validators=validators, media_type="model/gltf-binary")
+
+    def figure(
+        self,
+        figure: FigureName,
+        form: FigureFormat,
+        image_v: ImageV,
+        *,
+        name: str,
+        drawers: CapacityLimiter,
+    ) -> Download:
+        """Answer with a picture, drawn in a thread of `drawers`.
+
+        It is refused with `smsr.errors.FiguresUnavailable` or `smsr.errors.NothingToDraw`.
+        """
+
+        def draw() -> bytes:
+            return figures.draw(figure, self._figure_source(image_v), form)
+
+        async def make() -> Content:
+            return held_content(await to_thread.run_sync(draw, limiter=drawers))
+
+        return Download(
+            make,
+            name=name,
+            validators=self._validators_of((figure, form, image_v)),
+            media_type="image/png" if form == "png" else "image/svg+xml",
+            inline=True,
         )
-        # Each version of the writer and each choice of options makes other bytes.
-        kind = hashlib.sha256(f"{smsr.__version__} {options}".encode()).hexdigest()[:12]
-        validators = replace(self.validators, tag=f"{self.validators.tag}-{kind}", dated=False)
-        return Download(content, name=name, validators=validators, media_type="model/gltf-binary")
+
+    def _validators_of(self, kind: object) -> Validators:
+        """Each version of the writers and each choice makes other bytes."""
+        digest = hashlib.sha256(f"{smsr.__version__} {kind}".encode()).hexdigest()[:12]
+        return replace(self.validators, tag=f"{self.validators.tag}-{digest}", dated=False)
 
     def _glb(self, options: GlbOptions) -> Glb:
         """Look at the shapes, once for each way to take frames of them."""
-        shapes, faces = self.shapes, self.faces
-        row = shapes.dtype.itemsize * 3
-
-        def read(start: int, stop: int) -> NDArray[Any]:
-            data = self.storage.get_range(
-                shapes.key, shapes.offset + start * row, (stop - start) * row
-            )
-            return np.frombuffer(data, shapes.dtype).reshape(-1, 3)
-
-        size = self.cameras.dtype.itemsize * 6
-        camera = self.storage.get_range(self.cameras.key, self.cameras.offset, size)
-        triangles = None
-        if faces is not None:
-            data = self.storage.get_range(faces.key, faces.offset, faces.size - faces.offset)
-            triangles = np.frombuffer(data, faces.dtype).reshape(-1, 3)
         made = Glb(
-            read,
+            self._shape_rows,
             frames=self.frames,
             points=self.points,
-            camera=np.frombuffer(camera, self.cameras.dtype).reshape(2, 3),
-            faces=triangles,
+            camera=self._numbers(self.cameras)[0],
+            faces=None if self.faces is None else self._numbers(self.faces),
             options=options,
             bounds=self.bounds.get(options.every),
         )
         if len(self.bounds) < _KEPT_BOUNDS:
             self.bounds[options.every] = made.bounds
         return made
+
+    def _figure_source(self, image_v: ImageV) -> FigureSource:
+        few = self.face_count <= figures.MOST_TRIANGLES
+        return FigureSource(
+            json.loads(
+                self.storage.get(self.shapes.key.removesuffix("shapes.npy") + "report.json")
+            ),
+            self._numbers(self.cameras),
+            self._numbers(self.translations),
+            self.points,
+            self._shape_rows,
+            self._numbers(self.faces) if self.faces is not None and few else None,
+            image_v,
+        )
+
+    def _shape_rows(self, start: int, stop: int) -> NDArray[Any]:
+        """Read rows of the shapes as a (T N, 3) matrix."""
+        row = self.shapes.dtype.itemsize * 3
+        offset = self.shapes.offset + start * row
+        data = self.storage.get_range(self.shapes.key, offset, (stop - start) * row)
+        return np.frombuffer(data, self.shapes.dtype).reshape(-1, 3)
+
+    def _numbers(self, array: StoredArray) -> NDArray[Any]:
+        """Read a whole array of those that do not grow with T x N."""
+        data = self.storage.get_range(array.key, array.offset, array.size - array.offset)
+        return np.frombuffer(data, array.dtype).reshape(array.shape)
 
     # Archives
 
@@ -354,12 +400,18 @@ class OpenResults:
     storage : ObjectStorage
     capacity : int
         How many results are remembered; each takes a few hundred bytes.
+
+    Attributes
+    ----------
+    drawers : CapacityLimiter
+        Lets one figure at a time be drawn, so that those that wait occupy no thread.
     """
 
     def __init__(self, storage: ObjectStorage, capacity: int = 1000) -> None:
         self._storage = storage
         self._capacity = capacity
         self._opened: dict[str, ResultFiles] = {}
+        self.drawers = CapacityLimiter(1)
 
     async def open(self, record: JobRecord) -> ResultFiles:
         """Return the files of a job that succeeded.
@@ -389,7 +441,8 @@ class Download(Response):
 
     Parameters
     ----------
-    content : Content
+    content : Content, or a callable that makes it
+        It is made only where the client does not have it already.
     name : str
         File name offered to the client.
     validators : Validators
@@ -402,7 +455,7 @@ class Download(Response):
 
     def __init__(
         self,
-        content: Content,
+        content: Content | Callable[[], Awaitable[Content]],
         *,
         name: str,
         validators: Validators,
@@ -410,9 +463,10 @@ class Download(Response):
         sha256: str | None = None,
         inline: bool = False,
     ) -> None:
+        seekable = not isinstance(content, Content) or content.seekable
         headers = validators.headers | {
             "Content-Disposition": disposition(name, inline=inline),
-            "Accept-Ranges": "bytes" if content.seekable else "none",
+            "Accept-Ranges": "bytes" if seekable else "none",
             # To be kept by the client alone, and asked for again: a retry makes a new result.
             "Cache-Control": "private, no-cache",
         }
@@ -433,10 +487,11 @@ class Download(Response):
             A precondition fails, or the range is outside of the file.
         """
         headers = Headers(scope=scope)
-        content = self._content
-        size = content.size
         try:
             self._validators.check(headers)
+            made = self._content
+            content = made if isinstance(made, Content) else await made()
+            size = content.size
             part = None
             # Section 14.2: a range means something with GET only.
             if scope["method"] == "GET" and content.seekable and "range" in headers:

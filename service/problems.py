@@ -449,6 +449,8 @@ _STATUS = {
     "too-large": 413,
     "numerical-failure": 500,
     "cancelled": 410,
+    "figures-unavailable": 501,
+    "nothing-to-draw": 404,
     "worker-lost": 500,
     "out-of-memory": 500,
     "input-missing": 500,
@@ -483,6 +485,8 @@ _REMEDIES = {
     "invalid-option": "GET /v1/info lists type, range and choices of every option.",
     "animation-too-large": "Ask for fewer frames by the parameter `every`; the problem's member "
     "`every` has a value that fits. The NPZ and the PLY files have no such limit.",
+    "figures-unavailable": "Ask the operator to install the extra `smsr[plot]`.",
+    "nothing-to-draw": "Ask for another figure; the error needs ground truth with the job.",
     "cancelled": "Submit again if the result is wanted after all.",
     "numerical-failure": "Tell the operator the id of the job.",
     "time-limit": "Raise the option `time_limit`, or send fewer points or frames.",
@@ -516,7 +520,9 @@ _OF_JOBS = (*_of_exceptions(errors), *_of_exceptions(worker_problems))
 
 CATALOGUE: dict[str, ProblemType] = {kind.slug: kind for kind in (*_OF_JOBS, *_OF_THE_SERVICE)}
 
-JOB_PROBLEMS = frozenset(kind.slug for kind in _OF_JOBS) - {errors.AnimationTooLarge.slug}
+_OF_VIEWS = {"animation-too-large", "figures-unavailable", "nothing-to-draw"}
+
+JOB_PROBLEMS = frozenset(kind.slug for kind in _OF_JOBS) - _OF_VIEWS
 """Problems that may end a job."""
 
 

@@ -125,6 +125,10 @@ class JobLinks(BaseModel):
     translations: str | None = Field(description="translations.npy, float64 (T, 2)")
     faces: str | None = Field(description="faces.npy, (F, 3), where faces were sent")
     glb: str | None = Field(description="result.glb, the animated surface (glTF 2.0)")
+    figure: str | None = Field(
+        description="URI template (RFC 6570) of a figure: `name` is `convergence`, "
+        "`singular-values`, `error`, `shapes` or `cameras`, `form` is `png` or `svg`"
+    )
     report: str | None = Field(description="report.json")
 
 
@@ -205,6 +209,7 @@ class Job(BaseModel):
                         "translations": f"{_SELF}/translations.npy",
                         "faces": None,
                         "glb": f"{_SELF}/result.glb",
+                        "figure": f"{_SELF}/figures/{{name}}.{{form}}",
                         "report": f"{_SELF}/report.json",
                     },
                 }
@@ -407,6 +412,7 @@ def job_document(
             translations=f"{here}/translations.npy" if done else None,
             faces=f"{here}/faces.npy" if done and "faces" in record.inputs else None,
             glb=f"{here}/result.glb" if done else None,
+            figure=f"{here}/figures/{{name}}.{{form}}" if done else None,
             report=f"{here}/report.json" if done else None,
         ),
     )

@@ -177,6 +177,20 @@ class AnimationTooLarge(SmsrError):
     title = "The animation is too large for one file"
 
 
+class FiguresUnavailable(SmsrError):
+    """Matplotlib is not installed."""
+
+    slug = "figures-unavailable"
+    title = "Figures cannot be drawn here"
+
+
+class NothingToDraw(SmsrError):
+    """The result has nothing that this figure shows."""
+
+    slug = "nothing-to-draw"
+    title = "The result has nothing that this figure shows"
+
+
 class Cancelled(SmsrError):
     """The progress callback asked the run to stop."""
 

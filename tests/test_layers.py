@@ -15,6 +15,7 @@ SOLVER_LIBRARIES = {"numpy", "scipy", "threadpoolctl", "h5py"}
 OF_AN_EXTRA = {
     "smsr/cluster.py": {"dask", "zarr"},
     "smsr/devices.py": {"array_api_compat"},
+    "smsr/figures.py": {"matplotlib"},
 }
 WEB_LIBRARIES = {"fastapi", "starlette", "uvicorn", "httpx", "typer", "rich", "multipart"}
 

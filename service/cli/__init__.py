@@ -24,6 +24,7 @@ app = typer.Typer(
 app.command()(local.reconstruct)
 app.command()(local.evaluate)
 app.command()(results.convert)
+app.command()(results.plot)
 app.command()(local.options)
 app.command()(local.example)
 app.command()(remote.submit)

@@ -18,6 +18,7 @@ from service.downloads import (
     safe_media_type,
 )
 from service.problems import Problem, example_responses
+from smsr.figures import FigureFormat, FigureName
 from smsr.files.glb import GlbOptions, ImageV
 from worker.records import JobRecord
 from worker.storage import ObjectMissing
@@ -158,7 +159,7 @@ async def get_glb(
     """
     files = await _open(shared, job_id)
     options = GlbOptions(fps, quantised, every, image_v)
-    return await files.animation(options, f"smsr-{job_id}.glb")
+    return files.animation(options, f"smsr-{job_id}.glb")
 
 
 @router.get(
@@ -261,4 +262,42 @@ async def get_input(
         validators=Validators(file.sha256, record.created_at, dated=True),
         media_type=safe_media_type(file.content_type),
         sha256=file.sha256,
+    )
+
+
+@router.get(
+    "/figures/{name}.{form}",
+    summary="A figure of the run",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "The picture.",
+            "content": {
+                "image/png": {"schema": {"type": "string", "format": "binary"}},
+                "image/svg+xml": {"schema": {"type": "string"}},
+            },
+        },
+        **_PROBLEMS,
+        **example_responses(
+            "unknown-job", "nothing-to-draw", "invalid-request", "figures-unavailable"
+        ),
+    },
+)
+async def get_figure(
+    shared: Shared,
+    job_id: JobId,
+    name: FigureName,
+    form: FigureFormat,
+    image_v: Annotated[
+        ImageV,
+        Query(description="Where the second image coordinate grows to: `down` for pixels."),
+    ] = "up",
+) -> Download:
+    """Return a picture of the residuals, the singular values, the error, the shapes or the cameras.
+
+    `error` is there where ground truth was sent. Pictures read in black and white.
+    """
+    files = await _open(shared, job_id)
+    return files.figure(
+        name, form, image_v, name=f"smsr-{job_id}-{name}.{form}", drawers=shared.results.drawers
     )

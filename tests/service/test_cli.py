@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from service.cli import main
+from smsr.figures import NAMES
 from smsr.files import GlbOptions, open_result, write_glb
 from smsr.synthetic import write_example
 from tests.conftest import clean_environment, serving
@@ -109,6 +110,28 @@ def test_reconstruct_writes_an_animation_where_asked(example: Path, tmp_path: Pa
     succeeded(smsr("reconstruct", tracks, "-o", tmp_path / "r", "--no-ply", "--glb"))
     succeeded(smsr("convert", tmp_path / "r", "-o", tmp_path / "a.glb"))
     assert (tmp_path / "r" / "result.glb").read_bytes() == (tmp_path / "a.glb").read_bytes()
+
+
+def test_a_result_is_drawn(result: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    done = smsr("plot", result, "-o", tmp_path / "all")
+    drawn = {Path(line).stem for line in succeeded(done).splitlines()}
+    assert {path.name for path in (tmp_path / "all").iterdir()} == {f"{n}.png" for n in drawn}
+    stages = json.loads((result / "report.json").read_text())["stages"]
+    iterated = any(stage["residuals"] for stage in stages)
+    assert drawn == set(NAMES) - (set() if iterated else {"convergence"})
+    assert iterated or "convergence: " in done.stderr
+    succeeded(smsr("plot", result / "result.npz", "error", "--format", "svg", "-o", tmp_path))
+    e3d = json.loads((result / "report.json").read_text())["metrics"]["e3d"]
+    assert f"e3D = {e3d:.4f}" in (tmp_path / "error.svg").read_text()
+    (tmp_path / "result.npz").write_bytes((result / "result.npz").read_bytes())
+    alone = smsr("plot", tmp_path)
+    assert succeeded(alone).split() == [
+        str(tmp_path / "figures" / f"{name}.png") for name in ("shapes", "cameras")
+    ]
+    assert "error: " in alone.stderr
+    assert smsr("plot", tmp_path, "error").returncode == 1
+    assert smsr("plot", tmp_path, "errors").returncode == 2
 
 
 def test_evaluate_agrees_with_the_report(result: Path, example: Path) -> None:

@@ -4,6 +4,7 @@ import io
 import json
 import zipfile
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import numpy as np
 import plyfile
@@ -22,6 +23,12 @@ if TYPE_CHECKING:
 
     from smsr import Reconstruction
     from smsr.synthetic import Example
+
+
+DOWNLOADS = (
+    *("result.npz", "frames.zip", "frames/0.ply", "report.json"),
+    *("result.glb", "figures/shapes.svg"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +189,47 @@ def test_animations_that_make_no_sense_are_refused(
     problem(client.get(f"{bare_job['links']['glb']}?{query}"), "invalid-request", 422)
 
 
+def test_figures_are_those_of_the_result(
+    client: httpx.Client, job: dict[str, Any], bare_job: dict[str, Any]
+) -> None:
+    pytest.importorskip("matplotlib")
+    for name in ("convergence", "singular-values", "shapes", "cameras"):
+        url = bare_job["links"]["figure"].replace("{name}", name)
+        vector = client.get(url.replace("{form}", "svg"))
+        assert vector.headers["content-type"].startswith("image/svg+xml")
+        assert ElementTree.fromstring(vector.content).tag == "{http://www.w3.org/2000/svg}svg"
+        again = client.get(
+            url.replace("{form}", "svg"), headers={"If-None-Match": vector.headers["etag"]}
+        )
+        assert (again.status_code, again.content) == (304, b"")
+        raster = client.get(url.replace("{form}", "png"))
+        assert raster.headers["content-type"] == "image/png"
+        assert raster.headers["etag"] != vector.headers["etag"]
+        assert raster.content.startswith(b"\x89PNG\r\n")
+        assert raster.headers["content-disposition"].startswith("inline")
+    clouds, meshes = (
+        client.get(f"/v1/jobs/{document['id']}/figures/shapes.png").content
+        for document in (bare_job, job)
+    )
+    assert clouds != meshes
+    problem(client.get(f"/v1/jobs/{job['id']}/figures/error.png"), "nothing-to-draw", 404)
+    for path in ("figures/none.png", "figures/error.gif"):
+        problem(client.get(f"/v1/jobs/{job['id']}/{path}"), "invalid-request", 422)
+
+
+def test_the_error_is_drawn_where_there_is_truth(
+    client: httpx.Client, example: Example, tracks: bytes
+) -> None:
+    pytest.importorskip("matplotlib")
+    files = {
+        "measurements": ("w.npy", tracks),
+        "ground_truth": ("s.npy", npy(example.ground_truth)),
+    }
+    job = finished(client, submit(client, files))
+    answer = client.get(f"/v1/jobs/{job['id']}/figures/error.svg")
+    assert f"e3D = {job['metrics']['e3d']:.4f}" in answer.text
+
+
 def test_more_frames_than_a_file_can_animate(client: httpx.Client) -> None:
     tracks = make_low_rank(2060, 6).measurements.astype(np.float32)
     job = finished(client, submit(client, {"measurements": ("w.npy", npy(tracks))}))
@@ -202,7 +250,14 @@ def test_frames_out_of_range(client: httpx.Client, job: dict[str, Any]) -> None:
 def test_an_unfinished_job_has_no_result_yet(idle_api: Api, tracks: bytes) -> None:
     with idle_api.client() as client:
         url = submit(client, {"measurements": ("w.npy", tracks)}).headers["Location"]
-        for path in ("result.npz", "frames.zip", "frames/0.ply", "report.json"):
+        for path in (
+            "result.npz",
+            "frames.zip",
+            "frames/0.ply",
+            "report.json",
+            "result.glb",
+            "figures/shapes.svg",
+        ):
             answer = client.get(f"{url}/{path}")
             assert problem(answer, "job-unfinished", 409)["job_status"] == "queued"
             assert int(answer.headers["Retry-After"]) > 0
@@ -214,7 +269,14 @@ def test_a_failed_job_says_why_wherever_its_result_is_asked_for(client: httpx.Cl
     assert job["status"] == "failed"
     assert job["problem"]["type"] == "/problems/constant-measurements"
     assert job["problem"]["instance"] == f"/v1/jobs/{job['id']}"
-    for path in ("result.npz", "frames.zip", "frames/0.ply", "report.json"):
+    for path in (
+        "result.npz",
+        "frames.zip",
+        "frames/0.ply",
+        "report.json",
+        "result.glb",
+        "figures/shapes.svg",
+    ):
         document = problem(client.get(f"/v1/jobs/{job['id']}/{path}"), "job-failed", 409)
         assert document["cause"]["type"] == "/problems/constant-measurements"
 
@@ -225,7 +287,14 @@ def test_results_that_vanish_while_they_are_asked_for(api: Api, tracks: bytes) -
         job = finished(client, submit(client, {"measurements": ("w.npy", tracks)}))
         for path in (api.objects / "results" / job["id"]).rglob("*.*"):
             path.unlink()
-        for path in ("result.npz", "frames.zip", "frames/0.ply", "report.json"):
+        for path in (
+            "result.npz",
+            "frames.zip",
+            "frames/0.ply",
+            "report.json",
+            "result.glb",
+            "figures/shapes.svg",
+        ):
             problem(client.get(f"/v1/jobs/{job['id']}/{path}"), "result-gone", 410)
         assert client.get(f"/v1/jobs/{job['id']}").json()["diagnostics"] is None
         client.delete(f"/v1/jobs/{job['id']}")
