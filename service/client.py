@@ -17,6 +17,7 @@ import io
 import json
 import os
 import time
+import uuid
 from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
@@ -48,6 +49,7 @@ _TRY_AGAIN: Final = frozenset(
         HTTPStatus.GATEWAY_TIMEOUT,
     }
 )
+_NOT_YET: Final = frozenset({"submission-in-progress"})
 _REFUSALS: Final = frozenset(
     {
         HTTPStatus.BAD_REQUEST,
@@ -201,7 +203,9 @@ class Client:
         """Upload files and start a job.
 
         Files are streamed. Those of `resumable` bytes and more together go over by the tus protocol
-        (`upload`): after a broken connection the upload goes on where it stood.
+        (`upload`): after a broken connection the upload goes on where it stood. Where an answer is
+        lost, the submission is repeated under the same Idempotency-Key, so that there is one job in
+        the end.
 
         Parameters
         ----------
@@ -227,8 +231,9 @@ class Client:
         """
         paths = {"measurements": measurements, "ground_truth": ground_truth, "faces": faces}
         given = {role: Path(path) for role, path in paths.items() if path is not None}
+        headers = {"Idempotency-Key": str(uuid.uuid4())}
         if sum(path.stat().st_size for path in given.values()) >= resumable:
-            return self._submit_uploads(given, options, progress)
+            return self._submit_uploads(given, options, headers, progress)
         with contextlib.ExitStack() as stack:
             counter = _Counter(sum(path.stat().st_size for path in given.values()), progress)
             files = {
@@ -242,7 +247,7 @@ class Client:
                     file.seek(0)
                 # The options go first, so that the server can refuse early.
                 data = {"options": json.dumps(dict(options))} if options else {}
-                return self._http.post("/v1/jobs", data=data, files=files)
+                return self._http.post("/v1/jobs", data=data, files=files, headers=headers)
 
             return Job.model_validate(self._insist(send).json())
 
@@ -250,6 +255,7 @@ class Client:
         self,
         files: Mapping[str, Path],
         options: Mapping[str, object] | None,
+        headers: Mapping[str, str],
         progress: Transferred | None,
     ) -> Job:
         counter = _Counter(sum(path.stat().st_size for path in files.values()), progress)
@@ -257,7 +263,7 @@ class Client:
         document: dict[str, object] = {"options": dict(options or {})}
         for role, path in files.items():
             document[role] = {"upload": self._upload(path, role, counter)}
-        send = functools.partial(self._http.post, "/v1/jobs", json=document)
+        send = functools.partial(self._http.post, "/v1/jobs", json=document, headers=headers)
         return Job.model_validate(self._insist(send).json())
 
     def upload(self, path: AnyPath, *, progress: Transferred | None = None) -> str:
@@ -517,9 +523,10 @@ class Client:
                 if not response.is_error:
                     return response
                 wanted = _retry_after(response)
-                busy = response.status_code in _TRY_AGAIN
+                refusal = _service_error(response)
+                busy = response.status_code in _TRY_AGAIN or refusal.slug in _NOT_YET
                 if not busy or time.monotonic() + max(pause, wanted) > deadline:
-                    raise _service_error(response)
+                    raise refusal
             time.sleep(max(pause, wanted))
             pause = min(2 * pause, _LONGEST_PAUSE)
 

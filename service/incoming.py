@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import json
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,7 +18,7 @@ from service import quotas
 from service.bodies import Body
 from service.digests import BodyDigests
 from service.problems import Problem
-from service.submissions import SETTINGS, Submission, check_webhook, read_settings
+from service.submissions import SETTINGS, Submission, check_webhook, hash_of, read_settings
 from service.uploads import FILES, OPTIONS_BYTES, UploadLimits, check_files
 from smsr.errors import SmsrError
 from smsr.files import HEAD_BYTES, check_prefix
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from service.context import Context
+    from service.submissions import JobSettings
     from smsr.files import Role
     from worker.records import InputFile
     from worker.uploads import UploadStore
@@ -374,13 +377,33 @@ def is_json(headers: Headers) -> bool:
     return headers.get("content-type", "").partition(";")[0].strip().lower() == "application/json"
 
 
-async def receive_references(request: Request, job_id: str, shared: Context) -> Submission:
-    """Read the JSON document of a submission and take the uploads that it names.
+@dataclass(frozen=True, slots=True)
+class References:
+    """A submission that names uploads, by role."""
+
+    uploads: dict[Role, str]
+    options: JobOptions
+    settings: JobSettings
+
+    @property
+    def fingerprint(self) -> str:
+        """What tells submissions apart; a job that has taken the uploads does not change it."""
+        return hash_of(
+            {
+                "options": dataclasses.asdict(self.options),
+                "settings": self.settings.model_dump(mode="json"),
+                "uploads": self.uploads,
+            }
+        )
+
+
+async def read_references(request: Request, shared: Context) -> References:
+    """Read the JSON document of a submission.
 
     Raises
     ------
     Problem, smsr.errors.SmsrError
-        The submission is refused; the uploads are what they were.
+        The document is refused.
     """
     document = await _read_document(request)
     ids = {role: _reference(role, document[role]) for role in FILES if role in document}
@@ -404,12 +427,24 @@ async def receive_references(request: Request, job_id: str, shared: Context) -> 
     settings = read_settings(
         {name: document[name] for name in SETTINGS if name in document}, shared.settings
     )
-    await check_webhook(shared.settings, settings)
-    uploads = {role: await finish(shared, await find(shared, id_)) for role, id_ in ids.items()}
+    return References(ids, options, settings)
+
+
+async def take_references(shared: Context, references: References, job_id: str) -> Submission:
+    """Take the uploads that a submission names.
+
+    Raises
+    ------
+    Problem, smsr.errors.SmsrError
+        The submission is refused; the uploads are what they were.
+    """
+    await check_webhook(shared.settings, references.settings)
+    options, named = references.options, references.uploads.items()
+    uploads = {role: await finish(shared, await find(shared, id_)) for role, id_ in named}
     frames, points = await _check(shared, uploads, options)
     inputs = await _take(shared, uploads, job_id)
     folders = {upload.id: upload.folder for upload in uploads.values()}
-    return Submission(options, inputs, frames, points, settings, folders)
+    return Submission(options, inputs, frames, points, references.settings, folders)
 
 
 async def _read_document(request: Request) -> dict[str, Any]:

@@ -259,6 +259,38 @@ _OF_THE_SERVICE = (
         "Read `detail`; /docs describes every setting, and `settings` lists their names.",
     ),
     ProblemType(
+        "invalid-idempotency-key",
+        "The Idempotency-Key cannot be used",
+        400,
+        "The header Idempotency-Key names a submission; it holds 1 to 255 printable ASCII "
+        "characters.",
+        "Send a random key, a UUID for instance, with each new submission, and the same one again "
+        "when the submission is repeated.",
+    ),
+    ProblemType(
+        "idempotency-key-reused",
+        "The Idempotency-Key belongs to another submission",
+        422,
+        "A submission with other files, options or settings was accepted under this key.",
+        "Send a key of its own with each new submission.",
+    ),
+    ProblemType(
+        "submission-in-progress",
+        "The first submission under this Idempotency-Key is on its way",
+        409,
+        "Another request with the same key has not been answered yet; it may have broken off a "
+        "moment ago.",
+        "Send the submission again, under the same key, after the seconds in Retry-After.",
+    ),
+    ProblemType(
+        "submission-gone",
+        "The job of this Idempotency-Key is gone",
+        410,
+        "The submission was accepted before; its job, named by the member `job`, has been deleted "
+        "or has expired since.",
+        "Submit under a new key if the job is wanted again.",
+    ),
+    ProblemType(
         "upload-too-large",
         "The upload is larger than the limit",
         413,

@@ -24,9 +24,17 @@ from pydantic_core import PydanticCustomError
 from redis.exceptions import RedisError
 
 import smsr
+from service.idempotency import in_progress
 from service.problems import Problem
 from service.targets import MAX_URL, TargetRefused, Targets
-from worker.records import JobRecord, Priority, TooManyBytes, TooManyJobs, upload_prefix
+from worker.records import (
+    JobRecord,
+    KeyTaken,
+    Priority,
+    TooManyBytes,
+    TooManyJobs,
+    upload_prefix,
+)
 from worker.settings import Settings
 from worker.storage import StorageError
 
@@ -38,8 +46,8 @@ if TYPE_CHECKING:
     from service.context import Context
     from smsr.files import Role
     from worker.options import JobOptions
-    from worker.records import InputFile
-    from worker.storage import ObjectStorage
+    from worker.records import IdempotencyKey, InputFile
+    from worker.storage import Sink
 
 _log = logging.getLogger(__name__)
 
@@ -207,7 +215,7 @@ def digest_of(submission: Submission, owner: str | None) -> str:
     options = dataclasses.asdict(submission.options)
     for name in _NOT_IN_RESULTS:
         del options[name]
-    return _hash(
+    return hash_of(
         {
             "owner": owner,
             "solver": smsr.__version__,
@@ -220,13 +228,30 @@ def digest_of(submission: Submission, owner: str | None) -> str:
     )
 
 
-def _hash(document: object) -> str:
+def hash_of(document: object) -> str:
+    """Return the SHA-256 of a JSON document, whatever the order of its members."""
     text = json.dumps(document, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def fingerprint_of(submission: Submission) -> str:
+    """Return what tells submissions apart: files and their names, options and settings."""
+    return hash_of(
+        {
+            "options": dataclasses.asdict(submission.options),
+            "settings": submission.settings.model_dump(mode="json"),
+            "inputs": {role: [f.name, f.sha256] for role, f in submission.inputs.items()},
+        }
+    )
+
+
 async def accept(
-    shared: Context, job_id: str, submission: Submission, uploads: Sequence[str] = ()
+    shared: Context,
+    job_id: str,
+    submission: Submission,
+    uploads: Sequence[str] = (),
+    *,
+    key: IdempotencyKey | None = None,
 ) -> JobRecord:
     """Make a submission a job of this request's owner; Redis may go away at any moment.
 
@@ -239,11 +264,15 @@ async def accept(
     submission : Submission
     uploads : sequence of str
         Ids of the finished uploads whose files the job has taken (`service.quotas.hold`).
+    key : IdempotencyKey, optional
+        Bound to the job.
 
     Raises
     ------
     TooManyJobs, TooManyBytes
         The owner may not have another one.
+    Problem
+        The claim to the key has lapsed, and it is another submission's now.
     """
     settings = submission.settings
     if not submission.from_uploads:
@@ -269,11 +298,12 @@ async def accept(
     held = (*uploads, *submission.from_uploads.values())
     reuse = shared.settings.reuse_results if settings.reuse is None else settings.reuse
     try:
-        return await to_thread.run_sync(
-            partial(shared.queue.submit, record, shared.allowance, held, reuse=reuse)
-        )
-    except (TooManyJobs, TooManyBytes):
+        submit = partial(shared.queue.submit, record, shared.allowance, held)
+        return await to_thread.run_sync(partial(submit, reuse=reuse, key=key))
+    except (TooManyJobs, TooManyBytes, KeyTaken) as error:
         await _undo(shared, record.id, submission)
+        if isinstance(error, KeyTaken):
+            raise in_progress() from None
         raise
     except RedisError:
         # A record without a place in the queue gets one by maintenance: it is accepted. Where not
@@ -311,7 +341,7 @@ async def _undo(shared: Context, job_id: str, submission: Submission) -> None:
         await to_thread.run_sync(shared.uploads.give_back, shared.owner, ids, job_id)
 
 
-async def discard_uploads(storage: ObjectStorage, job_id: str) -> None:
+async def discard_uploads(storage: Sink, job_id: str) -> None:
     """Remove the inputs of a job that will not be; where that fails, maintenance does it later."""
     try:
         await to_thread.run_sync(storage.delete_prefix, upload_prefix(job_id))

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
     from smsr.files import Role
     from worker.settings import Settings
-    from worker.storage import ObjectStorage
+    from worker.storage import Sink
 
 FILES: tuple[Role, ...] = ("measurements", "ground_truth", "faces")
 PARTS = (*FILES, "options", *SETTINGS)
@@ -100,7 +100,7 @@ class UploadLimits:
 async def receive_submission(
     request: Request,
     job_id: str,
-    storage: ObjectStorage,
+    storage: Sink,
     limits: UploadLimits,
     operator: Settings | None = None,
 ) -> Submission:
@@ -112,7 +112,7 @@ async def receive_submission(
         Its body is read here, once.
     job_id : str
         Names the objects.
-    storage : ObjectStorage
+    storage : Sink
     limits : UploadLimits
     operator : Settings, optional
         Bounds the settings that a job may have.
@@ -146,7 +146,7 @@ class _Upload:
         request: Request,
         boundary: str,
         job_id: str,
-        storage: ObjectStorage,
+        storage: Sink,
         limits: UploadLimits,
         operator: Settings | None,
     ) -> None:

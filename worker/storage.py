@@ -19,7 +19,7 @@ import uuid
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
@@ -84,6 +84,18 @@ class ListedObject:
     key: str
     bytes: int
     modified: float
+
+
+class Sink(Protocol):
+    """What takes the files of a submission."""
+
+    async def put_stream(self, key: str, chunks: AsyncIterable[bytes]) -> StoredObject:
+        """Take a file as its bytes arrive."""
+        ...
+
+    def delete_prefix(self, prefix: str) -> None:
+        """Forget the files under a prefix."""
+        ...
 
 
 class ObjectStorage:

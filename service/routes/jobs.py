@@ -1,5 +1,6 @@
 """Submitting, watching, cancelling and deleting jobs."""
 
+from contextlib import nullcontext
 from functools import partial
 from typing import Annotated, Any
 from urllib.parse import urlencode
@@ -11,10 +12,11 @@ from starlette.requests import ClientDisconnect
 from service import quotas
 from service.context import Context, JobId, Shared, root_of, unknown_job
 from service.downloads import diagnostics_of
-from service.incoming import is_json, limits_of, receive_references
+from service.idempotency import REPLAYED, ClaimedKey, Digests, claimed
+from service.incoming import is_json, limits_of, read_references, take_references
 from service.problems import Problem, example_responses
 from service.schemas import Job, JobList, JobStatus, job_document
-from service.submissions import Label, accept, settings_schema
+from service.submissions import Label, accept, fingerprint_of, settings_schema
 from service.uploads import FILES, receive_submission
 from service.waiting import preferred_wait, wait_until_final
 from smsr.options import describe
@@ -116,7 +118,15 @@ _BODY: dict[str, Any] = {
     summary="Submit a job",
     openapi_extra=_BODY,
     responses={
-        201: {"headers": {"Location": {"schema": {"type": "string"}, "description": "The job."}}},
+        201: {
+            "headers": {
+                "Location": {"schema": {"type": "string"}, "description": "The job."},
+                REPLAYED: {
+                    "schema": {"type": "string", "enum": ["true"]},
+                    "description": "The job was made by an earlier submission of this key.",
+                },
+            }
+        },
         **example_responses(
             "malformed-multipart",
             "malformed-json",
@@ -138,6 +148,10 @@ _BODY: dict[str, Any] = {
             "unknown-option",
             "invalid-option",
             "invalid-setting",
+            "invalid-idempotency-key",
+            "idempotency-key-reused",
+            "submission-in-progress",
+            "submission-gone",
             "odd-row-count",
             "too-few-frames",
             "too-few-points",
@@ -153,7 +167,19 @@ _BODY: dict[str, Any] = {
         ),
     },
 )
-async def submit(request: Request, response: Response, shared: Shared) -> Job:
+async def submit(
+    request: Request,
+    response: Response,
+    shared: Shared,
+    idempotency_key: Annotated[
+        str | None,
+        Header(
+            description="Names this submission. Sent again under the same key it makes no second "
+            "job; the answer is that of the first time, with the job as it is now.",
+            examples=["8e03978e-40d5-43e8-bc93-6894a57f9324"],
+        ),
+    ] = None,
+) -> Job:
     """Upload tracks and queue their reconstruction.
 
     The parts may come in any order. The beginning of each file is checked while it arrives, so
@@ -167,22 +193,49 @@ async def submit(request: Request, response: Response, shared: Shared) -> Job:
     """
     queue = shared.queue
     await to_thread.run_sync(queue.redis.ping)  # before a long upload, not after it
-    await quotas.check_jobs(shared)
     job_id = new_job_id()
-    async with quotas.room(shared, request, job_id) as body:
+    async with claimed(shared, idempotency_key, job_id) as key:
+        repeated = key is not None and key.bound
+        if not repeated:
+            await quotas.check_jobs(shared)
         try:
-            if is_json(body.headers):
-                submission = await receive_references(body, job_id, shared)
-            else:
-                submission = await receive_submission(
-                    body, job_id, shared.storage, limits_of(shared), shared.settings
-                )
+            async with (
+                nullcontext(request) if repeated else quotas.room(shared, request, job_id)
+            ) as body:
+                record = await _receive(body, shared, job_id, key)
         except ClientDisconnect:
             raise Problem("malformed-multipart", "The client went away.") from None
-        record = await accept(shared, job_id, submission)
+    if repeated:
+        response.headers[REPLAYED] = "true"
     document = job_document(record, root=root_of(request))
     response.headers["Location"] = document.links.self
     return document
+
+
+async def _receive(
+    request: Request, shared: Context, job_id: str, key: ClaimedKey | None
+) -> JobRecord:
+    """Make a job of the body; of a repeated one nothing is stored."""
+    if is_json(request.headers):
+        references = await read_references(request, shared)
+        fingerprint = references.fingerprint
+        if key is not None and key.bound:
+            return await key.replay(shared, fingerprint)
+        submission = await take_references(shared, references, job_id)
+    else:
+        repeated = key is not None and key.bound
+        submission = await receive_submission(
+            request,
+            job_id,
+            Digests() if repeated else shared.storage,
+            limits_of(shared),
+            shared.settings,
+        )
+        fingerprint = fingerprint_of(submission)
+        if key is not None and key.bound:
+            return await key.replay(shared, fingerprint)
+    binding = key.bind(fingerprint) if key is not None else None
+    return await accept(shared, job_id, submission, key=binding)
 
 
 @router.get(
