@@ -20,7 +20,7 @@ from service.context import Context
 from service.downloads import OpenResults
 from service.lingering import LingeringClose
 from service.metrics import MeasuredRequests, Metrics
-from service.routes import events, health, info, jobs, metrics, page, results, uploads
+from service.routes import batches, events, health, info, jobs, metrics, page, results, uploads
 from service.routes import problems as problem_pages
 from service.security import SecurityHeaders
 from service.webhooks import Deliverer
@@ -159,7 +159,8 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
     app.router.redirect_slashes = False
     problems.install(app)
     documentation.install(app)
-    for routes in (page, jobs, events, results, uploads, info, health, metrics, problem_pages):
+    ours = (page, jobs, batches, events, results, uploads, info, health, metrics, problem_pages)
+    for routes in ours:
         closed = routes.router.prefix.startswith("/v1") and routes is not info
         app.include_router(routes.router, dependencies=KEY_SCHEMES if closed else None)
         app.include_router(_heads_of(routes.router))

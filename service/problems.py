@@ -167,6 +167,13 @@ _OF_THE_SERVICE = (
         "Check the id. Deleted and expired jobs cannot be brought back; submit again.",
     ),
     ProblemType(
+        "unknown-batch",
+        "There is no such batch",
+        404,
+        "No job has this label: none was submitted with it, or all have been deleted or expired.",
+        "Check the label; GET /v1/batches lists all.",
+    ),
+    ProblemType(
         "unknown-frame",
         "There is no such frame",
         404,

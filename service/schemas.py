@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from smsr.options import OptionDescription
+    from worker.batches import Batch, BatchCounts
+    from worker.batches import Spread as NumberSpread
     from worker.records import JobRecord
     from worker.uploads import Upload
 
@@ -267,6 +269,82 @@ class JobList(BaseModel):
     next: str | None = Field(description="Path of the next page, as in the Link header (RFC 8288).")
 
 
+class Spread(BaseModel):
+    """How some numbers lie."""
+
+    count: int
+    mean: float
+    median: float
+    min: float
+    max: float
+
+
+class BatchLinks(BaseModel):
+    """Where to go from a batch; paths relative to the service, null where nothing is there."""
+
+    self: str
+    jobs: str
+    cancel: str | None
+    retry: str | None
+    results: str | None = Field(description="ZIP of the results of all jobs that succeeded")
+
+
+class BatchEntry(BaseModel):
+    """A batch in a list."""
+
+    label: str
+    total: int = Field(description="Number of jobs.")
+    jobs: dict[JobStatus, int] = Field(description="Number of jobs by status.")
+    created_at: datetime = Field(description="When its first job was submitted.")
+    latest_at: datetime = Field(description="When its latest job was submitted.")
+    links: BatchLinks
+
+
+class BatchTimings(BaseModel):
+    """Seconds of a batch."""
+
+    elapsed: float | None = Field(
+        description="From its first submission to its last end, once all jobs have ended."
+    )
+    run_total: float = Field(description="Run time of all jobs that succeeded, together.")
+    run: Spread | None = Field(description="Run times of the jobs that succeeded.")
+
+
+class BatchDocument(BatchEntry):
+    """A batch and what became of it so far."""
+
+    progress: float = Field(
+        description="Part that is done, 0 to 1: the mean over all jobs; ended ones count as done."
+    )
+    finished_at: datetime | None = Field(description="When its last job ended, once all have.")
+    e3d: Spread | None = Field(
+        description="Errors of the jobs that succeeded and had a ground truth."
+    )
+    timings: BatchTimings
+
+
+class BatchList(BaseModel):
+    """One page of batches, latest first."""
+
+    batches: list[BatchEntry]
+    next: str | None = Field(description="Path of the next page, as in the Link header (RFC 8288).")
+
+
+class BatchCancelled(BaseModel):
+    """What became of the jobs of a batch that was cancelled."""
+
+    cancelled: int = Field(description="Jobs that were queued and are cancelled.")
+    stopping: int = Field(description="Jobs that run and were asked to stop.")
+
+
+class BatchRetried(BaseModel):
+    """What became of the jobs of a batch that was retried."""
+
+    queued: int = Field(description="Jobs that are queued again.")
+    inputs_gone: int = Field(description="Jobs that failed for their input and keep no files.")
+    refused: int = Field(description="Jobs for which their owner has too many active ones.")
+
+
 class Option(BaseModel):
     """An option of a job."""
 
@@ -445,6 +523,51 @@ def _webhook(record: JobRecord) -> JobWebhook | None:
     for moment in ("delivered_at", "next_attempt_at"):
         known[moment] = _moment_or_none(float(known[moment])) if moment in known else None
     return JobWebhook(host=urlsplit(record.webhook).hostname or "", **known)
+
+
+def batch_entry(counts: BatchCounts, *, root: str) -> BatchEntry:
+    """Turn the counts of a batch into its entry in a list."""
+    here = f"{root}/v1/batches/{counts.label}"
+    jobs = counts.jobs
+    return BatchEntry(
+        label=counts.label,
+        total=counts.total,
+        jobs=dict(jobs),
+        created_at=_moment(counts.created_at),
+        latest_at=_moment(counts.latest_at),
+        links=BatchLinks(
+            self=here,
+            jobs=f"{root}/v1/jobs?batch={counts.label}",
+            cancel=f"{here}/cancel" if jobs["queued"] + jobs["running"] else None,
+            retry=f"{here}/retry" if jobs["failed"] + jobs["cancelled"] else None,
+            results=f"{here}/results.zip" if jobs["succeeded"] else None,
+        ),
+    )
+
+
+def batch_document(batch: Batch, *, root: str) -> BatchDocument:
+    """Turn a batch into its document."""
+    entry = batch_entry(batch.counts, root=root)
+    ended = batch.finished_at
+    return BatchDocument(
+        **entry.model_dump(),
+        progress=batch.progress,
+        finished_at=_moment_or_none(ended),
+        e3d=_spread(batch.e3d),
+        timings=BatchTimings(
+            elapsed=None if ended is None else max(0.0, ended - batch.counts.created_at),
+            run_total=batch.seconds.total if batch.seconds else 0.0,
+            run=_spread(batch.seconds),
+        ),
+    )
+
+
+def _spread(found: NumberSpread | None) -> Spread | None:
+    if found is None:
+        return None
+    return Spread(
+        count=found.count, mean=found.mean, median=found.median, min=found.least, max=found.most
+    )
 
 
 def _metrics(metrics: Mapping[str, Any], *, brief: bool) -> dict[str, Any]:

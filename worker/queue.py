@@ -28,6 +28,7 @@ from worker.records import (
     JobRecord,
     RecordStore,
     TooManyJobs,
+    record_key,
 )
 from worker.storage import ObjectMissing, ObjectStorage, StorageError
 
@@ -293,6 +294,62 @@ class JobQueue:
             # InvalidJobOperation: its worker has just finished and removed it.
             # ValueError: the execution's own hash has expired before its entry in the registry.
             self.redis.delete(Job.key_for(ticket))
+
+    # Many at once
+
+    def enqueue_many(self, job_ids: Sequence[str]) -> None:
+        """Give queued jobs tickets, as `enqueue` does, in few round trips."""
+        tickets = {job_id: f"{job_id}-{uuid.uuid4().hex[:12]}" for job_id in job_ids}
+        assigned = self.records.assign_tickets(tickets)
+        with self.redis.pipeline() as pipe:
+            for priority, queue in self.queues.items():
+                chosen = [job for job, found in assigned.items() if found and found[1] == priority]
+                queue.enqueue_many(
+                    [
+                        Queue.prepare_data(
+                            TASK,
+                            args=(job_id,),
+                            timeout=-1,
+                            result_ttl=0,
+                            failure_ttl=TICKET_TTL,
+                            description=job_id,
+                            job_id=tickets[job_id],
+                        )
+                        for job_id in chosen
+                    ],
+                    pipeline=pipe,
+                )
+            for found in assigned.values():
+                if found and found[0]:
+                    pipe.expire(Job.key_for(found[0]), FORMER_TICKET_TTL)
+            pipe.execute()
+
+    def discard_queued(self, tickets: Sequence[str]) -> None:
+        """Remove tickets that wait in a queue, or are over, in one round trip."""
+        with self.redis.pipeline(transaction=False) as pipe:
+            for ticket in tickets:
+                for queue in self.queues.values():
+                    pipe.lrem(queue.key, 0, ticket)
+                pipe.delete(Job.key_for(ticket))
+            pipe.execute()
+
+    def with_inputs(self, job_ids: Sequence[str]) -> Sequence[str]:
+        """Return those jobs whose input files have not been removed."""
+        with self.redis.pipeline(transaction=False) as pipe:
+            for job_id in job_ids:
+                pipe.hget(record_key(job_id), "input_bytes")
+            known = pipe.execute()
+        usable = []
+        for job_id, size in zip(job_ids, known, strict=True):
+            if size == b"0":
+                continue
+            if size is None and (record := self.records.get(job_id)) is not None:
+                try:  # a record of a version that did not keep account
+                    self._check_inputs(record)
+                except InputsGone:
+                    continue
+            usable.append(job_id)
+        return usable
 
     # Keeping order
 

@@ -712,6 +712,38 @@ class RecordStore:
         outcome, ticket, *unwanted = [part.decode() for part in answer]
         return outcome, ticket, unwanted
 
+    # The same for many jobs, in one round trip
+
+    def cancel_many(self, job_ids: Sequence[str]) -> Sequence[tuple[str, str]]:
+        """Cancel jobs; return outcome and ticket of each, as `cancel` does."""
+        return [_outcome(answer) for answer in self._steps("cancel", job_ids, self.result_ttl)]
+
+    def retry_many(self, job_ids: Sequence[str], allowance: Allowance = ANY) -> Sequence[str]:
+        """Make finished jobs queued again; return the outcome of each, as `retry` does."""
+        most = "" if allowance.jobs is None else allowance.jobs
+        return [answer.decode() for answer in self._steps("retry", job_ids, most)]
+
+    def delete_many(self, job_ids: Sequence[str]) -> Sequence[tuple[str, str]]:
+        """Remove records, and put their objects on the list of garbage; as `cancel_many`."""
+        return [_outcome(answer) for answer in self._steps("delete", job_ids, "0", 0)]
+
+    def assign_tickets(self, tickets: Mapping[str, str]) -> dict[str, tuple[str, Priority] | None]:
+        """Note the RQ jobs that carry some jobs, as `assign_ticket` does; return by job."""
+        with self.redis.pipeline(transaction=False) as pipe:
+            for job_id, ticket in tickets.items():
+                self._script(keys=[PREFIX], args=["ticket", job_id, ticket], client=pipe)
+            answers = pipe.execute()
+        return {
+            job_id: None if answer is None else (answer[0].decode(), answer[1].decode())
+            for job_id, answer in zip(tickets, answers, strict=True)
+        }
+
+    def _steps(self, step: str, job_ids: Sequence[str], *arguments: str | float) -> Sequence[Any]:
+        with self.redis.pipeline(transaction=False) as pipe:
+            for job_id in job_ids:
+                self._script(keys=[PREFIX], args=[step, job_id, *arguments], client=pipe)
+            return pipe.execute()
+
     # The worker's steps
 
     def begin_attempt(self, job_id: str, *, worker: str, ticket: str, lease: float) -> int | None:
@@ -854,6 +886,12 @@ class RecordStore:
     def without_ticket(self, grace: float, lists: Sequence[str]) -> Sequence[str]:
         """Return queued jobs whose ticket is in none of the RQ lists, for `grace` seconds now."""
         return [job_id.decode() for job_id in self._step("unticketed", "*", grace, *lists)]
+
+
+def _outcome(answer: Sequence[bytes]) -> tuple[str, str]:
+    """Return outcome and ticket, where there is one, of a step."""
+    outcome, ticket, *_ = (*answer, b"")
+    return outcome.decode(), ticket.decode()
 
 
 def decode(job_id: str, found: Mapping[bytes, bytes]) -> JobRecord | None:

@@ -129,6 +129,7 @@ def test_a_process_that_dies_in_between_neither_loses_nor_doubles_a_job(
 
     def halting() -> Iterator[bytes]:
         yield part + tracks[:5000]
+        wait_for(lambda: redis_process.client().keys("smsr:idempotency:*"))
         killed.send_signal(signal.SIGKILL)
         killed.wait()
         yield tracks[5000:]
