@@ -179,7 +179,8 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
     app.add_middleware(
         MeasuredRequests,
         metrics=measured.requests,
-        results={route.path for route in results.router.routes if isinstance(route, APIRoute)},
+        results={route.path for route in results.router.routes if isinstance(route, APIRoute)}
+        | {batches.RESULTS},
     )
     app.add_middleware(LingeringClose)
     return app

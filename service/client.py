@@ -22,11 +22,18 @@ from collections.abc import Callable
 from http import HTTPStatus
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final, Self, TypeAlias, cast
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlencode, urlsplit
 
 import httpx
 
-from service.schemas import Info, Job, JobList
+from service.schemas import (
+    BatchCancelled,
+    BatchDocument,
+    BatchRetried,
+    Info,
+    Job,
+    JobList,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -197,6 +204,7 @@ class Client:
         ground_truth: AnyPath | None = None,
         faces: AnyPath | None = None,
         options: Mapping[str, object] | None = None,
+        settings: Mapping[str, object] | None = None,
         progress: Transferred | None = None,
         resumable: int = RESUMABLE_BYTES,
     ) -> Job:
@@ -215,6 +223,8 @@ class Client:
             Known 3D shapes to measure the error against, and the triangles of the surface.
         options : mapping, optional
             Names and values of options.
+        settings : mapping, optional
+            How the job is treated: batch, priority, ttl, reuse, ...
         progress : callable, optional
             Called while the files go over.
         resumable : int
@@ -233,7 +243,7 @@ class Client:
         given = {role: Path(path) for role, path in paths.items() if path is not None}
         headers = {"Idempotency-Key": str(uuid.uuid4())}
         if sum(path.stat().st_size for path in given.values()) >= resumable:
-            return self._submit_uploads(given, options, headers, progress)
+            return self._submit_uploads(given, options, settings, headers, progress)
         with contextlib.ExitStack() as stack:
             counter = _Counter(sum(path.stat().st_size for path in given.values()), progress)
             files = {
@@ -247,6 +257,7 @@ class Client:
                     file.seek(0)
                 # The options go first, so that the server can refuse early.
                 data = {"options": json.dumps(dict(options))} if options else {}
+                data |= {name: _text(value) for name, value in (settings or {}).items()}
                 return self._http.post("/v1/jobs", data=data, files=files, headers=headers)
 
             return Job.model_validate(self._insist(send).json())
@@ -255,12 +266,13 @@ class Client:
         self,
         files: Mapping[str, Path],
         options: Mapping[str, object] | None,
+        settings: Mapping[str, object] | None,
         headers: Mapping[str, str],
         progress: Transferred | None,
     ) -> Job:
         counter = _Counter(sum(path.stat().st_size for path in files.values()), progress)
         counter.restart()
-        document: dict[str, object] = {"options": dict(options or {})}
+        document: dict[str, object] = {**(settings or {}), "options": dict(options or {})}
         for role, path in files.items():
             document[role] = {"upload": self._upload(path, role, counter)}
         send = functools.partial(self._http.post, "/v1/jobs", json=document, headers=headers)
@@ -398,20 +410,47 @@ class Client:
             if left < 1:
                 time.sleep(min(max(left, 0.05), 0.5))
 
-    def list(self, *, status: JobStatus | None = None) -> Iterator[Job]:
+    def list(self, *, status: JobStatus | None = None, batch: str | None = None) -> Iterator[Job]:
         """Yield jobs, newest first, a page at a time.
 
         Parameters
         ----------
         status : str, optional
             Only jobs of this status.
+        batch : str, optional
+            Only jobs of this batch.
         """
-        query: str | None = f"status={status}" if status else ""
+        given = {"status": status, "batch": batch}
+        query: str | None = urlencode({name: text for name, text in given.items() if text})
         while query is not None:
             found = JobList.model_validate(self._request("GET", f"/v1/jobs?{query}").json())
             yield from found.jobs
             # A path, perhaps with the prefix of a proxy that stands in our address already.
             query = None if found.next is None else urlsplit(found.next).query
+
+    def batch(self, label: str) -> BatchDocument:
+        """Return how far the jobs of a batch are."""
+        return BatchDocument.model_validate(self._request("GET", _batch(label)).json())
+
+    def cancel_batch(self, label: str) -> BatchCancelled:
+        """Cancel all jobs of a batch that have not ended."""
+        answer = self._request("POST", f"{_batch(label)}/cancel")
+        return BatchCancelled.model_validate(answer.json())
+
+    def retry_batch(self, label: str) -> BatchRetried:
+        """Queue those jobs of a batch again that failed or were cancelled."""
+        answer = self._request("POST", f"{_batch(label)}/retry")
+        return BatchRetried.model_validate(answer.json())
+
+    def delete_batch(self, label: str) -> None:
+        """Remove all jobs of a batch with their files."""
+        self._request("DELETE", _batch(label))
+
+    def download_batch(
+        self, label: str, target: AnyPath, *, progress: Transferred | None = None
+    ) -> Path:
+        """Fetch the results of a batch as a ZIP, which appears whole or not at all."""
+        return self._fetch(f"{_batch(label)}/results.zip", target, progress)
 
     def cancel(self, job_id: str) -> Job:
         """Cancel a queued or running job; a running one stops within seconds."""
@@ -454,10 +493,12 @@ class Client:
         Path
             `target`.
         """
+        return self._fetch(f"/v1/jobs/{job_id}/{what}", target, progress)
+
+    def _fetch(self, url: str, target: AnyPath, progress: Transferred | None) -> Path:
         target = Path(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         part = target.with_name(target.name + ".part")
-        url = f"/v1/jobs/{job_id}/{what}"
         tag = ""
 
         def fetch() -> httpx.Response:
@@ -574,6 +615,15 @@ def _strong_tag(response: httpx.Response) -> str:
     tag = str(response.headers.get("etag", ""))
     in_parts = response.headers.get("accept-ranges") == "bytes"
     return tag if in_parts and not tag.startswith("W/") else ""
+
+
+def _text(value: object) -> str:
+    """Return a setting as the text of a part."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _batch(label: str) -> str:
+    return f"/v1/batches/{quote(label, safe='')}"
 
 
 def _retry_after(response: httpx.Response) -> float:

@@ -27,6 +27,7 @@ from service.client import FINAL, Client, ClientError, require_success
 from service.schemas import JobStatus
 from smsr.options import parse
 from worker.options import JobOptions
+from worker.records import Priority
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -69,6 +70,7 @@ class _Order:
     ground_truth: str | None
     faces: Path | None
     options: dict[str, object]
+    settings: dict[str, object]
     wait: bool
     out: Path | None
     ply: bool
@@ -121,6 +123,25 @@ def submit(
     faces: Faces = None,
     preset: Preset = None,
     option: OptionValues = None,
+    batch: Annotated[
+        str | None, typer.Option(metavar="LABEL", help="Batch that the jobs belong to.")
+    ] = None,
+    priority: Annotated[
+        Priority | None, typer.Option(help="Jobs of a higher one start first.")
+    ] = None,
+    ttl: Annotated[
+        float | None,
+        typer.Option(
+            min=0, metavar="SECONDS", help="How long the server keeps them; 0 is for ever."
+        ),
+    ] = None,
+    reuse: Annotated[
+        bool | None,
+        typer.Option(
+            "--reuse/--no-reuse",
+            help="Take the result of an equal job, where there is one.  [default: the server's]",
+        ),
+    ] = None,
     ply: Annotated[bool, typer.Option(help="Download a PLY of every frame too.")] = True,
     parallel: Annotated[int, typer.Option(min=1, max=64, help="Files in hand at once.")] = 4,
     patience: Patience = 60.0,
@@ -133,7 +154,11 @@ def submit(
     """
     values = preset_and_options(JobOptions, preset, option)
     parse(JobOptions, values)
-    order = _Order(ground_truth, faces, values, wait or out is not None, out, ply)
+    asked = {"batch": batch, "priority": priority, "ttl": ttl, "reuse": reuse}
+    settings: dict[str, object] = {
+        name: value for name, value in asked.items() if value is not None
+    }
+    order = _Order(ground_truth, faces, values, settings, wait or out is not None, out, ply)
     with Client(server, patience=patience, api_key=api_key) as client, progress_bars() as bars:
         outcomes = _all(client, order, files, bars, parallel)
     if as_json:
@@ -224,6 +249,7 @@ class _Errand:
             ground_truth=self._order.truth_of(self._file),
             faces=self._order.faces,
             options=self._order.options,
+            settings=self._order.settings,
             progress=lambda done, total: self._at(share * done / max(total, 1), "uploading"),
         )
 
@@ -294,6 +320,56 @@ def _row(job: Job) -> tuple[str, ...]:
     )
 
 
+def batch(
+    label: Annotated[str, typer.Argument(metavar="LABEL", show_default=False)],
+    download: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--download", metavar="FILE.zip", help="Fetch the results of all its jobs."
+        ),
+    ] = None,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Cancel its unfinished jobs.")] = False,
+    retry: Annotated[
+        bool, typer.Option("--retry", help="Run its failed and cancelled jobs again.")
+    ] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Remove its jobs and files.")] = False,
+    server: Server = LOCAL_SERVER,
+    api_key: ApiKey = None,
+    patience: Patience = 60.0,
+    as_json: AsJson = False,
+) -> None:
+    """Look after the jobs that share a label: how far they are, or what the options say."""
+    if cancel + retry + delete + (download is not None) > 1:
+        raise typer.BadParameter("Say one thing to do at a time.")
+    with Client(server, api_key=api_key, patience=patience) as client:
+        if cancel:
+            ended = client.cancel_batch(label)
+            console.print(f"{label}: {ended.cancelled} cancelled, {ended.stopping} stopping")
+        elif retry:
+            again = client.retry_batch(label)
+            lost = again.inputs_gone + again.refused
+            console.print(f"{label}: {again.queued} queued, {lost} cannot be run again")
+        elif delete:
+            client.delete_batch(label)
+            console.print(f"{label} deleted")
+        elif download is not None:
+            client.download_batch(label, download)
+            console.print(f"{label}: {download}", soft_wrap=True)
+        else:
+            found = client.batch(label)
+            if as_json:
+                console.print_json(found.model_dump_json())
+                return
+            counts = ", ".join(f"{n} {status}" for status, n in found.jobs.items() if n)
+            console.print(f"{label}: {found.progress:.0%} of {found.total} jobs ({counts})")
+            if found.e3d is not None:
+                e3d = found.e3d
+                console.print(
+                    f"e3D of {e3d.count}: mean {e3d.mean:.4f}, median {e3d.median:.4f}, "
+                    f"{e3d.min:.4f} to {e3d.max:.4f}"
+                )
+
+
 jobs = typer.Typer(no_args_is_help=True, help="Look after the jobs of a server.")
 
 
@@ -302,13 +378,19 @@ def list_jobs(
     server: Server = LOCAL_SERVER,
     api_key: ApiKey = None,
     status: OfStatus = None,
+    batch: Annotated[
+        str | None, typer.Option(metavar="LABEL", help="Only jobs of this batch.")
+    ] = None,
     limit: Annotated[int, typer.Option(min=1, help="How many at most.")] = 50,
     patience: Patience = 5.0,
     as_json: AsJson = False,
 ) -> None:
     """List jobs, newest first."""
     with Client(server, patience=patience, api_key=api_key) as client:
-        found = [job for job, _ in zip(client.list(status=status), range(limit), strict=False)]
+        found = [
+            job
+            for job, _ in zip(client.list(status=status, batch=batch), range(limit), strict=False)
+        ]
     if as_json:
         console.print_json(data=[job.model_dump(mode="json") for job in found])
         return

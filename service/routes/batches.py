@@ -25,6 +25,9 @@ from worker.batches import Batch
 
 router = APIRouter(prefix="/v1/batches", tags=["batches"])
 
+RESULTS = "/v1/batches/{label}/results.zip"
+"""Route whose answers are results."""
+
 BatchLabel = Annotated[
     str, Path(pattern=LABEL_PATTERN, description="Label of the batch.", examples=["walk-17"])
 ]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -408,3 +410,25 @@ def workers_of(server: Served) -> list[int]:
 
 def alive(pid: int) -> bool:
     return any(pid == other and state != "Z" for other, _, state, _ in processes())
+
+
+def test_a_batch_from_the_command_line(served: Served, example: Path, tmp_path: Path) -> None:
+    label, server = f"cli-{tmp_path.name}", ("--server", served.url)
+    files = [shutil.copy(example / "measurements.npy", tmp_path / f"{n}.npy") for n in "ab"]
+    more = ("--batch", label, "--priority", "high", "--ttl", "600", "--wait", "--json")
+    jobs = json.loads(succeeded(smsr("submit", *files, *more, *server)))
+    assert [(job["batch"], job["priority"], job["ttl"]) for job in jobs] == [
+        (label, "high", 600.0)
+    ] * 2
+    shown = json.loads(succeeded(smsr("batch", label, "--json", *server)))
+    assert (shown["jobs"]["succeeded"], shown["progress"]) == (2, 1.0)
+    assert "100% of 2 jobs" in succeeded(smsr("batch", label, *server))
+    again = smsr("submit", files[0], "--reuse", "--batch", label, "--json", *server)
+    (reused,) = json.loads(succeeded(again))
+    assert reused["reused_from"] in {job["id"] for job in jobs}
+    succeeded(smsr("batch", label, "--download", tmp_path / "b.zip", *server))
+    with zipfile.ZipFile(tmp_path / "b.zip") as packed:
+        assert sum(name.endswith("/result.npz") for name in packed.namelist()) == 3
+    assert "deleted" in succeeded(smsr("batch", label, "--delete", *server))
+    assert smsr("batch", label, *server).returncode != 0
+    assert smsr("batch", label, "--delete", "--cancel", *server).returncode != 0
