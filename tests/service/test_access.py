@@ -160,9 +160,9 @@ def make_upload(client: httpx.Client, files: Files) -> str:
 
 
 def make_batch(client: httpx.Client, files: Files) -> str:
-    answer = client.post("/v1/jobs", files=files, data={"batch": "walk-17"})
+    answer = client.post("/v1/jobs", files=files, data={"batch": "a-batch-of-ann"})
     assert answer.status_code == 201, answer.text
-    return "walk-17"
+    return "a-batch-of-ann"
 
 
 OWNED = {"job_id": make_job, "upload_id": make_upload, "label": make_batch}
