@@ -66,6 +66,9 @@ def _options_schema() -> dict[str, Any]:
     return {"type": "object", "additionalProperties": False, "properties": properties}
 
 
+_TRACKS = "0,1,4,2,7\n3,0,2,5,1\n0,2,4,1,6\n3,1,2,4,1\n1,3,4,0,5\n2,1,3,5,0\n"
+"""The smallest file there can be, as an example: 5 points in 3 frames, as CSV."""
+
 _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
@@ -88,8 +91,11 @@ _BODY: dict[str, Any] = {
                         **settings_schema(),
                     },
                 },
-                "encoding": {"options": {"contentType": "application/json"}},
-                "example": {"options": {"layout": "interleaved"}, "measurements": "@tracks.npy"},
+                "encoding": {
+                    "options": {"contentType": "application/json"},
+                    **{str(role): {"contentType": "application/octet-stream"} for role in FILES},
+                },
+                "example": {"options": {"layout": "interleaved"}, "measurements": _TRACKS},
             },
             "application/json": {
                 "schema": {
@@ -306,8 +312,8 @@ async def get_job(
     response: Response,
     shared: Shared,
     job_id: JobId,
-    prefer: Annotated[
-        list[str] | None,
+    prefer: Annotated[  # noqa: ARG001  (documented here, but there may be several of it)
+        str | None,
         Header(
             description="`wait=N` answers when the job has ended, or after N seconds (RFC 7240).",
             examples=["wait=30"],
@@ -316,7 +322,7 @@ async def get_job(
 ) -> Job:
     """Return a job, at once or when it has ended."""
     record: JobRecord | None = await shared.record(job_id)
-    seconds = preferred_wait(prefer or ())
+    seconds = preferred_wait(request.headers.getlist("prefer"))
     if seconds is not None and record is not None:
         record = await wait_until_final(shared.feed, record, seconds)
         response.headers["Preference-Applied"] = f"wait={seconds}"
