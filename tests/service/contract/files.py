@@ -21,6 +21,12 @@ def npy(array: np.ndarray) -> bytes:
 
 SOUND = [npy(EXAMPLE.measurements), npy(EXAMPLE.ground_truth), npy(EXAMPLE.faces)]
 
-schemathesis.openapi.media_type(
-    "application/octet-stream", st.one_of(st.sampled_from(SOUND), st.binary(max_size=300))
-)
+for media_type in ("application/octet-stream", "application/offset+octet-stream"):
+    schemathesis.openapi.media_type(
+        media_type, st.one_of(st.sampled_from(SOUND), st.binary(max_size=300))
+    )
+
+
+@schemathesis.serializer("application/offset+octet-stream")
+def as_it_is(ctx: schemathesis.SerializationContext, value: bytes) -> bytes:
+    return value
