@@ -142,6 +142,7 @@ async def describe_uploads(shared: Shared) -> Response:
             "queue-unavailable",
             "storage-unavailable",
             "storage-full",
+            "too-many-bytes",
         ),
     },
 )
@@ -254,6 +255,7 @@ async def get_upload(
             "queue-unavailable",
             "storage-unavailable",
             "storage-full",
+            "too-many-bytes",
         ),
     },
 )
@@ -319,6 +321,7 @@ async def override_method(request: Request, shared: Shared, upload_id: UploadId)
             "queue-unavailable",
             "storage-unavailable",
             "storage-full",
+            "too-many-bytes",
         ),
     },
 )

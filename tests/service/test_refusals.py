@@ -235,7 +235,7 @@ def test_bodies_that_make_no_job(api: Api, client: httpx.Client, case: str) -> N
 
 
 @pytest.mark.parametrize(
-    "kind", ["application/json", "application/x-www-form-urlencoded", "", "multipart/mixed"]
+    "kind", ["application/x-www-form-urlencoded", "", "multipart/mixed", "text/json"]
 )
 def test_bodies_of_another_type(client: httpx.Client, kind: str) -> None:
     answer = client.post("/v1/jobs", content=b"{}", headers={"Content-Type": kind})
