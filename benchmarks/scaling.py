@@ -127,6 +127,7 @@ def service(folder: Path, url: str, workers: int, threads: int) -> Iterator[tupl
         "REDIS_URL": url,
         "SMSR_THREADS": str(threads),
         "SMSR_LOG_LEVEL": "WARNING",
+        "SMSR_REUSE_RESULTS": "false",
         "PYTHONPATH": str(Path(__file__).parents[1]),
     }
     command = [sys.executable, "-m", "service.cli", "serve", "--port", "0"]

@@ -109,7 +109,8 @@ class _Attempt:
         self.records = records
         self.record = record
         self.attempt = attempt
-        self.storage = ObjectStorage(settings.objects_url)
+        # Insisted upon like all else that the storage does: a start costs one of a few attempts.
+        self.storage = self._with_storage(partial(ObjectStorage, settings.objects_url))
         self.prefix = result_prefix(record.id, attempt)
         self.folder = settings.scratch / f"{record.id}-{attempt}"
         self.report = ProgressReporter(

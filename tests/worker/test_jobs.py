@@ -392,6 +392,24 @@ def test_a_storage_that_fails_for_a_while(
     check_success(queue, wait_for_end(queue, job_id), example)
 
 
+def test_a_storage_that_is_away_when_a_job_begins_costs_no_attempts(
+    queue: JobQueue, submit: Submitter, start_worker: Workers, example: Example
+) -> None:
+    job_id = submit()
+    folder = queue.storage.folder
+    assert folder is not None
+    away = folder.rename(folder.with_name("away"))
+    folder.write_bytes(b"")
+    start_worker.start(storage_retry_seconds=20)
+    wait_for(queue, job_id, lambda record: record.status == "running")
+    time.sleep(1.5)
+    folder.unlink()
+    away.rename(folder)
+    record = wait_for_end(queue, job_id)
+    check_success(queue, record, example)
+    assert record.attempt == 1
+
+
 def test_a_storage_that_fails_for_long(
     queue: JobQueue, submit: Submitter, start_worker: Workers
 ) -> None:
