@@ -29,6 +29,10 @@ export function significant(value: number, digits = 3): string {
   return String(Number(value.toPrecision(digits)));
 }
 
+/** An error with three digits, trailing zeros too, so that a column of them lines up. */
+export const precise = (value: number): string =>
+  Math.abs(value) >= 1e4 || Math.abs(value) < 1e-4 ? significant(value) : value.toPrecision(3);
+
 const relative = new Intl.RelativeTimeFormat("en", { numeric: "auto" });
 
 export function ago(moment: string): string {

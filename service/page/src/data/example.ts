@@ -2,28 +2,40 @@
 
 import { writeNpy } from "./npy";
 
+/** Half the width of the sheet in pixels. */
+const SCALE = 170;
+
 export function exampleFiles(frames = 60, side = 40): File[] {
   const points = side * side;
   const truth = new Float32Array(frames * points * 3);
   const tracks = new Float32Array(2 * frames * points);
   for (let t = 0; t < frames; t += 1) {
     const time = t / (frames - 1);
-    const yaw = 0.9 * Math.sin(3 * Math.PI * time + 0.6);
-    const pitch = 0.35 * Math.sin(2.2 * Math.PI * time + 1.1);
+    const yaw = 0.95 * Math.sin(3 * Math.PI * time + 0.6);
+    const pitch = 0.42 * Math.sin(2.2 * Math.PI * time + 1.1);
+    const roll = 0.1 * Math.sin(1.4 * Math.PI * time);
     const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
+    const [cr, sr] = [Math.cos(roll), Math.sin(roll)];
+    // A mean shape and three ways to deform, each with a rhythm of its own.
+    const breath = Math.sin(4 * Math.PI * time);
+    const fold = Math.sin(6 * Math.PI * time + 1);
+    const twist = Math.cos(2.6 * Math.PI * time + 0.3);
     for (let i = 0; i < points; i += 1) {
       const a = (2 * (i % side)) / (side - 1) - 1;
       const b = (2 * Math.floor(i / side)) / (side - 1) - 1;
-      const breath = 1 + 0.25 * Math.sin(4 * Math.PI * time);
-      const fold = 0.22 * Math.sin(5 * time + 2.2) * Math.cos(2.4 * a + 1.2 * b);
-      const wave = 0.16 * Math.sin(3 * a - 7 * time) * (0.4 + 0.6 * b * b);
-      const x = 170 * (a + 0.08 * b * Math.sin(6 * time));
-      const y = 170 * 1.1 * b;
-      const z = -170 * (0.75 * breath * (1 - 0.55 * a * a - 0.35 * b * b) + fold + wave);
+      const x = SCALE * (a + 0.1 * twist * b);
+      const y = SCALE * (1.1 * b + 0.06 * breath * a * a);
+      const z =
+        -SCALE *
+        (0.8 * (1 - 0.55 * a * a - 0.35 * b * b) +
+          0.14 * breath * (1 - a * a) +
+          0.13 * fold * Math.cos(2.2 * a + b) +
+          0.12 * twist * Math.sin(2.6 * a) * b);
+      const u = cy * x + sy * z;
+      const v = sp * sy * x + cp * y - sp * cy * z;
       truth.set([x, y, z], 3 * (t * points + i));
-      tracks[2 * t * points + i] = cy * x + sy * z + 320 + 20 * Math.sin(5 * time);
-      tracks[(2 * t + 1) * points + i] =
-        sp * sy * x + cp * y - sp * cy * z + 240 + 12 * Math.cos(4 * time);
+      tracks[2 * t * points + i] = cr * u - sr * v + 320;
+      tracks[(2 * t + 1) * points + i] = sr * u + cr * v + 240;
     }
   }
   const faces: number[] = [];

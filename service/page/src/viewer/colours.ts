@@ -25,7 +25,7 @@ export function ramp(steps = 256): Uint8Array {
 }
 
 /** Round numbers that divide a range into about `wanted` parts. */
-export function ticks(low: number, high: number, wanted = 4): number[] {
+export function ticks(low: number, high: number, wanted = 5): number[] {
   if (!(high > low)) return [low];
   const rough = (high - low) / wanted;
   const power = 10 ** Math.floor(Math.log10(rough));

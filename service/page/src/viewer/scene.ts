@@ -38,6 +38,8 @@ export interface Look {
   truth: boolean;
   path: boolean;
   follow: boolean;
+  /** Draw all points even where pictures then come slowly. */
+  whole: boolean;
 }
 
 const VERTEX = /* glsl */ `
@@ -112,7 +114,7 @@ void main() {
 const PLAIN = new Vector3(0.6, 0.74, 0.9);
 const TRUTH = new Vector3(1.0, 0.62, 0.25);
 /** Distance of the drawn cameras from the middle, in radii of the object. */
-const PATH_RADII = 2.4;
+const PATH_RADII = 1.8;
 /** Points whose values stand for all where a range of colours is looked for. */
 const SAMPLE = 2000;
 
@@ -159,6 +161,7 @@ export class Scene {
     truth: false,
     path: false,
     follow: false,
+    whole: false,
   };
   /** Part of the points that is drawn while playing. */
   detail = 1;
@@ -305,7 +308,7 @@ export class Scene {
   get drawn(): number {
     const all = this.frames[0]?.position.count ?? 0;
     if (this.look.mesh && this.hasFaces) return all;
-    return this.playing ? Math.ceil(all * this.detail) : all;
+    return this.playing && !this.look.whole ? Math.ceil(all * this.detail) : all;
   }
 
   seek(time: number, playing: boolean): void {
@@ -502,7 +505,7 @@ export class Scene {
   private fitting(): number {
     const half =
       Math.tan(((this.camera.fov / 2) * Math.PI) / 180) * Math.min(1, this.camera.aspect);
-    const size = this.look.path ? (PATH_RADII + 0.4) * this.radius : 1.08 * this.radius;
+    const size = this.look.path ? (PATH_RADII + 0.25) * this.radius : 1.02 * this.radius;
     return size / half;
   }
 
@@ -553,7 +556,7 @@ export class Scene {
     if (now - this.adapted < 750 || this.pictures.length < 5) return;
     this.adapted = now;
     this.rate = (1000 * (this.pictures.length - 1)) / (now - this.pictures[0]);
-    if (!(this.look.mesh && this.hasFaces)) {
+    if (!(this.look.mesh && this.hasFaces) && !this.look.whole) {
       const before = this.detail;
       if (this.rate < 28) this.detail = Math.max(0.05, this.detail * Math.max(0.5, this.rate / 34));
       else if (this.rate > 50) this.detail = Math.min(1, this.detail * 1.25);

@@ -168,6 +168,8 @@ class Viewer {
       this.restyle({ follow: follow.checked });
       if (!follow.checked) this.scene?.resetView();
     });
+    const whole = h("input", { type: "checkbox", id: "whole" });
+    whole.addEventListener("change", () => this.restyle({ whole: whole.checked }));
     this.triangulateRow.hidden = true;
     this.truthRow.hidden = true;
     const keys = h(
@@ -241,6 +243,7 @@ class Viewer {
           this.truthRow,
           this.check(path, "Camera path"),
           this.check(follow, "See as the camera"),
+          this.check(whole, "All points, however slow"),
         ),
         keys,
       ),

@@ -3,7 +3,7 @@
 import { address, isActive, type Job, save } from "../api";
 import { h, icon, replace, say } from "../dom";
 import { followJob } from "../events";
-import { bytes, count, exact, label, seconds, sentence, significant } from "../format";
+import { bytes, count, exact, label, precise, seconds, sentence, significant } from "../format";
 import { errorPanel, problemPanel } from "../problem";
 import { actions, badge, title } from "./parts";
 
@@ -246,12 +246,12 @@ function accuracyCard(job: Job): HTMLElement {
       ? h(
           "p",
           { class: "headline" },
-          h("strong", { class: "e3d" }, significant(metrics.e3d)),
+          h("strong", { class: "e3d" }, precise(metrics.e3d)),
           h("span", {}, " e3D, the mean error in σ of the ground truth"),
         )
       : null,
     facts([
-      ["Each frame aligned", metrics?.e3d_per_frame ? significant(metrics.e3d_per_frame) : null],
+      ["Each frame aligned", metrics?.e3d_per_frame ? precise(metrics.e3d_per_frame) : null],
       ["Compared in", metrics?.frame ? `the ${metrics.frame} frame` : null],
       ["Camera", diagnostics?.camera_model],
       ["Basis shapes", diagnostics ? String(diagnostics.basis_size) : null],

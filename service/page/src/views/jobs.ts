@@ -3,7 +3,7 @@
 import { isActive, type Job, listJobs } from "../api";
 import { append, h, replace } from "../dom";
 import { followJobs } from "../events";
-import { ago, count, exact, significant } from "../format";
+import { ago, count, exact, precise } from "../format";
 import { errorPanel } from "../problem";
 import { actions, badge, title } from "./parts";
 
@@ -65,7 +65,7 @@ export function jobsView(signal: AbortSignal, short = false): HTMLElement {
   };
   const rowOf = (job: Job): HTMLElement => {
     const extent = job.frames && job.points ? `${count(job.frames)} × ${count(job.points)}` : "–";
-    const e3d = job.metrics ? significant(job.metrics.e3d) : "–";
+    const e3d = job.metrics ? precise(job.metrics.e3d) : "–";
     return h(
       "tr",
       { "data-id": job.id },

@@ -1,0 +1,513 @@
+"""The web page as people use it, in a real browser against a real server and worker."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from typing import TYPE_CHECKING, Any
+
+import httpx
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from smsr.synthetic import make_example
+from tests.browser.conftest import PATIENCE, visiting
+from tests.conftest import ROOT
+from tests.service.conftest import api_running, finished, npy, settings_for
+from worker.keys import KeyStore
+from worker.pool import WorkerPool
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from playwright.sync_api import Browser, Locator, Page
+
+    from tests.browser.conftest import Visit
+    from tests.conftest import RedisProcess
+    from tests.service.conftest import Api
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+AXE = ROOT / "service" / "page" / "node_modules" / "axe-core" / "axe.min.js"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def patience() -> Iterator[None]:
+    expect.set_options(timeout=PATIENCE)
+    yield
+    expect.set_options(timeout=5000)
+
+
+@pytest.fixture(scope="module")
+def files() -> dict[str, bytes]:
+    example = make_example(frames=30, side=20)
+    return {
+        "tracks.npy": npy(example.measurements.astype(np.float32)),
+        "truth_gt.npy": npy(example.ground_truth.astype(np.float32)),
+        "faces.npy": npy(example.faces),
+    }
+
+
+@pytest.fixture(scope="module")
+def job(site: Api, files: dict[str, bytes]) -> dict[str, Any]:
+    """A job with ground truth and faces that has succeeded."""
+    sent = {
+        "measurements": ("tracks.npy", files["tracks.npy"]),
+        "ground_truth": ("truth_gt.npy", files["truth_gt.npy"]),
+        "faces": ("faces.npy", files["faces.npy"]),
+    }
+    with site.client() as client:
+        done = finished(client, client.post("/v1/jobs", files=sent))
+    assert done["status"] == "succeeded", done
+    return done
+
+
+def drop(page: Page, files: dict[str, bytes]) -> None:
+    """Drop files on the page, as from a file manager."""
+    contents = {name: base64.b64encode(content).decode() for name, content in files.items()}
+    transfer = page.evaluate_handle(
+        """(contents) => {
+            const transfer = new DataTransfer();
+            for (const [name, content] of Object.entries(contents)) {
+                const bytes = Uint8Array.from(atob(content), (c) => c.charCodeAt(0));
+                transfer.items.add(new File([bytes], name));
+            }
+            return transfer;
+        }""",
+        contents,
+    )
+    for event in ("dragenter", "dragover", "drop"):
+        page.dispatch_event("[data-drop]", event, {"dataTransfer": transfer})
+
+
+def viewer_of(visit: Visit, job: dict[str, Any]) -> Page:
+    """Open the viewer of a job, and wait until all is there."""
+    page = visit.open(f"/#/jobs/{job['id']}")
+    page.wait_for_selector(".viewer[data-complete]")
+    return page
+
+
+def still_viewer_of(visit: Visit, job: dict[str, Any]) -> Page:
+    """Open the viewer of a job for someone who asked for no motion: nothing plays by itself."""
+    visit.page.emulate_media(reduced_motion="reduce")
+    return viewer_of(visit, job)
+
+
+def picture(page: Page, selector: str = ".surface") -> bytes:
+    """Return the pixels of an element, once what was asked to be drawn has been."""
+    page.evaluate(
+        "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )
+    return page.locator(selector).screenshot()
+
+
+def pixels(page: Page, selector: str = ".surface") -> Any:
+    """Return how many pixels of a canvas are not empty, and their mean colour."""
+    return page.evaluate(
+        """async ([selector, encoded]) => {
+            const bytes = Uint8Array.from(atob(encoded), (c) => c.charCodeAt(0));
+            const picture = await createImageBitmap(new Blob([bytes]));
+            const canvas = new OffscreenCanvas(picture.width, picture.height);
+            const context = canvas.getContext("2d");
+            context.drawImage(picture, 0, 0);
+            const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+            let bright = 0;
+            for (let i = 0; i < data.length; i += 4) {
+                if (data[i] + data[i + 1] + data[i + 2] > 240) bright += 1;
+            }
+            return bright;
+        }""",
+        [selector, base64.b64encode(picture(page, selector)).decode()],
+    )
+
+
+def frame_of(page: Page) -> str | None:
+    return page.locator(".viewer").get_attribute("data-frame")
+
+
+def test_dropped_files_become_a_surface(visit: Visit, files: dict[str, bytes]) -> None:
+    page = visit.page
+    page.add_init_script(
+        """window.seen = [];
+        new MutationObserver(() => {
+            for (const part of document.querySelectorAll(".stage-name, .percent, .badge")) {
+                if (part.textContent) window.seen.push(part.textContent);
+            }
+        }).observe(document, { childList: true, subtree: true, characterData: true });"""
+    )
+    visit.open()
+    drop(page, files)
+    rows = page.locator(".files li")
+    expect(rows).to_have_count(3)
+    roles = {
+        row.locator("strong").inner_text(): row.locator("select").input_value()
+        for row in rows.all()
+    }
+    assert roles == {
+        "tracks.npy": "measurements",
+        "truth_gt.npy": "ground_truth",
+        "faces.npy": "faces",
+    }
+    expect(rows.filter(has_text="tracks.npy")).to_contain_text("30 frames of 400 points")
+    assert pixels(page, ".preview canvas") > 400, "the tracks are shown before they are sent"
+
+    page.get_by_role("button", name="Send").click()
+    page.wait_for_selector(".viewer[data-complete]")
+    seen = page.evaluate("window.seen")
+    assert any(re.fullmatch(r"\d+ %|Running.*|Waiting.*|A worker.*", text) for text in seen), seen
+    assert pixels(page) > 2000
+    shown = page.locator(".e3d").inner_text()
+    job = httpx.get(f"{visit.api.url}/v1/jobs/{page.url.rpartition('/')[2]}").json()
+    assert float(shown) == pytest.approx(job["metrics"]["e3d"], rel=5e-3)
+
+
+def test_options_are_sent_where_they_differ(visit: Visit, files: dict[str, bytes]) -> None:
+    page = visit.open()
+    page.set_input_files(
+        "#files",
+        [
+            {
+                "name": "w.npy",
+                "mimeType": "application/octet-stream",
+                "buffer": files["tracks.npy"],
+            }
+        ],
+    )
+    page.get_by_label("Camera model").select_option("relaxed")
+    page.get_by_text("More options").click()
+    page.get_by_label("Basis size").fill("4")
+    with page.expect_request(lambda request: request.method == "POST") as sent:
+        page.get_by_role("button", name="Send").click()
+    body = sent.value.post_data_buffer
+    assert body is not None
+    assert b'{"camera_model":"relaxed","basis_size":4}' in body
+    page.wait_for_selector(".viewer[data-loaded]")
+
+
+def test_the_surface_moves_and_time_can_be_scrubbed(visit: Visit, job: dict[str, Any]) -> None:
+    page = viewer_of(visit, job)
+    playing = page.get_by_role("button", name="Pause")
+    expect(playing).to_be_visible()  # it plays by itself
+    first = frame_of(page)
+    page.wait_for_function(
+        "(f) => document.querySelector('.viewer').dataset.frame !== f", arg=first
+    )
+    playing.click()
+    page.locator(".scrub").fill("0")
+    start = picture(page)
+    assert start == picture(page), "a paused picture stands still"
+    page.locator(".scrub").fill("15")
+    assert frame_of(page) == "15"
+    assert page.locator(".frame-label").inner_text() == "16 / 30"
+    assert picture(page) != start
+    tracks = picture(page, ".stage-2d canvas")
+    page.get_by_role("button", name="Frame on").click()
+    assert frame_of(page) == "16"
+    assert picture(page, ".stage-2d canvas") != tracks
+
+
+def test_each_colouring_is_another_picture_with_a_legend(visit: Visit, job: dict[str, Any]) -> None:
+    page = still_viewer_of(visit, job)
+    page.locator(".scrub").fill("10")
+    seen: dict[str, bytes] = {}
+    for name, legend in {
+        "depth": "Depth",
+        "motion": "3D motion",
+        "error": "ground truth",
+        "plain": None,
+    }.items():
+        page.select_option("#colour", name)
+        if legend is None:
+            expect(page.locator(".legend")).to_be_hidden()
+        else:
+            expect(page.locator(".legend")).to_contain_text(legend)
+            assert page.locator(".legend .tick").count() >= 2
+        page.uncheck("#mesh")
+        seen[f"{name} points"] = picture(page)
+        page.check("#mesh")
+        seen[f"{name} mesh"] = picture(page)
+    assert len(set(seen.values())) == len(seen)
+
+
+def test_errors_of_the_page_are_those_of_the_service(visit: Visit, job: dict[str, Any]) -> None:
+    """The page aligns the ground truth on its own, as smsr.metrics does."""
+    page = still_viewer_of(visit, job)
+    found = json.loads(page.locator(".viewer").get_attribute("data-errors") or "[]")
+    assert found == pytest.approx(job["metrics"]["per_frame"], abs=2e-5)
+    expect(page.locator(".error-plot path.plot-line")).to_be_visible()
+    without = picture(page)
+    page.check("#truth")
+    assert picture(page) != without
+
+
+def test_points_without_faces_can_be_triangulated(
+    visit: Visit, site: Api, files: dict[str, bytes]
+) -> None:
+    with site.client() as client:
+        sent = client.post("/v1/jobs", files={"measurements": ("w.npy", files["tracks.npy"])})
+        done = finished(client, sent)
+    page = still_viewer_of(visit, done)
+    cloud = pixels(page)
+    expect(page.locator("#mesh")).to_be_disabled()
+    page.check("#triangulate")
+    expect(page.locator("#mesh")).to_be_checked()
+    expect(page.locator(".stage-note")).to_contain_text("triangulation")
+    assert pixels(page) > cloud
+
+
+def test_the_view_turns_and_the_cameras_are_shown(visit: Visit, job: dict[str, Any]) -> None:
+    page = still_viewer_of(visit, job)
+    front = picture(page)
+    box = page.locator(".surface").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 150, y + 40, steps=4)
+    page.mouse.up()
+    assert picture(page) != front
+    page.get_by_role("button", name="Reset the view").click()
+    page.wait_for_timeout(300)
+    for box_id in ("#path", "#follow"):
+        before = picture(page)
+        page.check(box_id)
+        assert picture(page) != before, box_id
+        page.uncheck(box_id)
+
+
+def test_downloads_are_the_bytes_of_the_api(
+    visit: Visit, job: dict[str, Any], tmp_path: Path
+) -> None:
+    page = still_viewer_of(visit, job)
+    page.locator(".scrub").fill("7")
+    links = job["links"]
+    wanted = {
+        ".npz": links["result"],
+        "-frames.zip": links["frames"],
+        "-frame-0007.ply": links["frame"].replace("{t}", "7"),
+        "-report.json": links["report"],
+    }
+    buttons = page.locator(".downloads button")
+    for button in buttons.all():
+        with page.expect_download() as download:
+            button.click()
+        name = download.value.suggested_filename
+        suffix = next((end for end in wanted if name.endswith(end)), None)
+        if suffix is None:
+            assert name.endswith(".glb"), name
+            continue
+        download.value.save_as(tmp_path / name)
+        assert (tmp_path / name).read_bytes() == httpx.get(
+            visit.api.url + wanted.pop(suffix)
+        ).content
+    assert wanted == {}
+    arrays = np.load(next(tmp_path.glob("*.npz")))
+    assert arrays["shapes"].shape == (30, 400, 3)
+
+
+def test_a_file_that_is_none_is_refused_in_words(visit: Visit) -> None:
+    visit.refusals_expected = True
+    page = visit.open()
+    drop(page, {"tracks.npy": b"this is no array of numbers, whatever its name says"})
+    page.get_by_role("button", name="Send").click()
+    alert = page.get_by_role("alert")
+    expect(alert.get_by_role("heading")).to_be_visible()
+    expect(alert).to_contain_text("What helps:")
+    link = alert.get_by_role("link", name="About this problem")
+    with page.expect_popup() if link.get_attribute("target") else page.expect_navigation():
+        link.click()
+    assert "/problems/" in page.url
+    expect(page.locator("body")).to_contain_text(re.compile("remed|help|Send|Write", re.I))
+
+
+def test_a_job_that_fails_says_why(visit: Visit, site: Api) -> None:
+    example = make_example(frames=10, side=5)
+    W = example.measurements.astype(np.float32)
+    W[3, 20] = np.nan
+    with site.client() as client:
+        done = finished(client, client.post("/v1/jobs", files={"measurements": ("w.npy", npy(W))}))
+    assert done["status"] == "failed"
+    page = visit.open(f"/#/jobs/{done['id']}")
+    alert = page.get_by_role("alert")
+    expect(alert).to_contain_text(done["problem"]["title"])
+    expect(alert).to_contain_text(done["problem"]["detail"])
+    expect(alert).to_contain_text("missing")  # the remedy names the option
+
+
+def test_files_that_the_page_cannot_read_are_sent_all_the_same(
+    visit: Visit, files: dict[str, bytes]
+) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, W=np.load(io.BytesIO(files["tracks.npy"])))
+    page = visit.open()
+    drop(page, {"tracks.npz": buffer.getvalue()})
+    expect(page.locator(".files .note")).to_contain_text("no preview")
+    expect(page.locator(".preview")).to_be_hidden()
+    page.get_by_role("button", name="Send").click()
+    page.wait_for_selector(".viewer[data-complete]")
+    expect(page.locator(".stage-2d figcaption")).to_contain_text("projected")
+
+
+def focused(page: Page) -> Locator:
+    return page.locator(":focus")
+
+
+def tab_to(page: Page, name: str) -> None:
+    """Press Tab until an element of a name has the focus, which must be seen each time."""
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        here = focused(page)
+        if not here.count():
+            continue
+        outline = here.evaluate("e => getComputedStyle(e).outlineStyle")
+        hidden = here.evaluate("e => e.classList.contains('only-heard')")
+        assert hidden or outline != "none", here.evaluate("e => e.outerHTML")
+        text = here.evaluate(
+            "e => e.getAttribute('aria-label') || e.labels?.[0]?.textContent || e.textContent"
+        )
+        if name in text:
+            return
+    raise AssertionError(f"{name} cannot be reached by Tab")
+
+
+def test_all_works_by_keyboard(visit: Visit) -> None:
+    visit.page.emulate_media(reduced_motion="reduce")
+    page = visit.open()
+    page.wait_for_selector(".options select")
+    tab_to(page, "try a generated example")
+    page.keyboard.press("Enter")
+    expect(page.locator(".files li")).to_have_count(3)
+    tab_to(page, "Send")
+    page.keyboard.press("Enter")
+    page.wait_for_selector(".viewer[data-complete]")
+    tab_to(page, "The surface in 3D")
+    front = picture(page)
+    page.keyboard.press("d")
+    page.wait_for_timeout(200)
+    assert picture(page) != front
+    page.keyboard.press("ArrowRight")
+    assert frame_of(page) == "1"
+    page.keyboard.press("Shift+ArrowRight")
+    assert frame_of(page) == "11"
+    page.keyboard.press("End")
+    assert frame_of(page) == "59"
+    page.keyboard.press("Space")
+    expect(page.get_by_role("button", name="Pause")).to_be_visible()
+    page.keyboard.press("Space")
+    expect(page.get_by_role("button", name="Play")).to_be_visible()
+    tab_to(page, "Play")
+    page.keyboard.press("Space")
+    expect(page.get_by_role("button", name="Pause")).to_be_visible()
+    tab_to(page, "Delete")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("dialog")).to_contain_text("Delete")
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+
+
+def test_the_list_follows_jobs_and_deletes_them(
+    visit: Visit, site: Api, files: dict[str, bytes]
+) -> None:
+    page = visit.open("/#/jobs")
+    page.wait_for_selector("table")
+    with site.client() as client:
+        sent = client.post("/v1/jobs", files={"measurements": ("mine.npy", files["tracks.npy"])})
+        row = page.locator(f"tr[data-id='{sent.json()['id']}']")
+        expect(row).to_be_visible()
+        expect(row).to_contain_text("Done")
+        expect(row).to_contain_text("30 × 400")
+        row.get_by_role("button", name="Delete").click()
+        page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+        expect(row).to_have_count(0)
+        assert client.get(sent.headers["Location"]).status_code == 404
+
+
+def test_a_key_is_asked_for_where_one_is_needed(
+    browser: Browser,
+    page_built: Path,
+    files: dict[str, bytes],
+    tmp_path: Path,
+    api_redis: RedisProcess,
+) -> None:
+    settings = settings_for(tmp_path, api_redis, access="keys")
+    _, secret = KeyStore(api_redis.client()).create("ada")
+    assert page_built.is_dir()
+    with (
+        WorkerPool(settings, 1),
+        api_running(settings, api_redis, tmp_path / "api.log") as guarded,
+        visiting(browser, guarded) as visit,
+    ):
+        visit.refusals_expected = True
+        page = visit.open()
+        page.get_by_label("API key").fill("smsr_wrong")
+        page.get_by_role("button", name="Use it").click()
+        expect(page.locator(".key-form")).to_contain_text("does not take this key")
+        page.locator("#key-input").fill(secret)
+        page.get_by_role("button", name="Use it").click()
+        expect(page.locator(".empty")).to_contain_text("No jobs yet")
+        expect(page.locator(".key-form")).to_have_count(0)
+        drop(page, {"tracks.npy": files["tracks.npy"]})
+        page.get_by_role("button", name="Send").click()
+        page.wait_for_selector(".viewer[data-complete]")
+        with page.expect_download() as download:
+            page.locator(".downloads button").first.click()
+        assert download.value.path().stat().st_size > 1000
+        assert page.evaluate("localStorage.length") == 0
+
+
+def test_a_phone_shows_everything_without_scrolling_sideways(
+    browser: Browser, site: Api, job: dict[str, Any]
+) -> None:
+    phone = {"viewport": {"width": 375, "height": 740}, "device_scale_factor": 2}
+    with visiting(browser, site, **phone, is_mobile=True, has_touch=True) as visit:
+        for path in ("/", "/#/jobs"):
+            page = visit.open(path)
+            page.reload()
+            page.wait_for_selector("main > *")
+            assert page.evaluate("document.documentElement.scrollWidth") <= 375, path
+        page = viewer_of(visit, job)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 375
+        for selector in (".surface", ".stage-2d canvas"):
+            box = page.locator(selector).bounding_box()
+            assert box is not None
+            assert box["width"] > 300
+            assert box["height"] > 150
+        page.get_by_role("button", name="Pause").tap()
+        expect(page.get_by_role("button", name="Play")).to_be_visible()
+        assert pixels(page) > 2000
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_serious_finding_of_axe(
+    browser: Browser, site: Api, job: dict[str, Any], files: dict[str, bytes], scheme: str
+) -> None:
+    if not AXE.is_file():
+        pytest.skip("axe-core is not installed (scripts/page installs it)")
+    with visiting(browser, site, color_scheme=scheme, reduced_motion="reduce") as visit:
+        found: dict[str, list[str]] = {}
+
+        def look(where: str) -> None:
+            visit.page.evaluate(AXE.read_text(encoding="utf-8"))
+            result = visit.page.evaluate("() => axe.run({ resultTypes: ['violations'] })")
+            for finding in result["violations"]:
+                if finding["impact"] in ("serious", "critical"):
+                    nodes = [node["html"] for node in finding["nodes"]]
+                    found[f"{where}: {finding['id']}"] = nodes
+
+        page = visit.open()
+        drop(page, files)
+        page.wait_for_selector(".options select")
+        page.get_by_text("More options").click()
+        look("new job")
+        visit.open("/#/jobs")
+        page.reload()
+        page.wait_for_selector("tbody tr")
+        look("jobs")
+        viewer_of(visit, job)
+        page.get_by_text("Keyboard", exact=True).click()
+        look("viewer")
+        assert found == {}
