@@ -1,9 +1,10 @@
 # Each target calls the script of its name in scripts/, which makes .venv and installs what is missing.
-.PHONY: help install page demo test test-containers lock lint format benchmark pictures clean
+.PHONY: help install page demo test test-browser test-containers lock lint format benchmark pictures clean
 
 help:
 	@echo "make demo       run the whole service on a generated example; results in demo-output/"
 	@echo "make test       run every test"
+	@echo "make test-browser  only the tests of the web page, in Chromium"
 	@echo "make test-containers  build the image, run the cluster and break it (needs a Docker Engine)"
 	@echo "make lock       pin the image's dependencies anew (docker/*.lock)"
 	@echo "make lint       style, format and types (make format mends what it can)"
@@ -24,6 +25,9 @@ demo:
 
 test:
 	@scripts/test
+
+test-browser:
+	@scripts/test-browser
 
 test-containers:
 	@scripts/test-containers

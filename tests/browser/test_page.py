@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import re
@@ -15,7 +16,7 @@ from playwright.sync_api import expect
 
 from smsr.synthetic import make_example
 from tests.browser.conftest import PATIENCE, visiting
-from tests.conftest import ROOT
+from tests.conftest import ROOT, redis_running
 from tests.service.conftest import api_running, finished, npy, settings_for
 from worker.keys import KeyStore
 from worker.pool import WorkerPool
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
 
     from tests.browser.conftest import Visit
-    from tests.conftest import RedisProcess
     from tests.service.conftest import Api
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -165,27 +165,21 @@ def test_dropped_files_become_a_surface(visit: Visit, files: dict[str, bytes]) -
     assert float(shown) == pytest.approx(job["metrics"]["e3d"], rel=5e-3)
 
 
-def test_options_are_sent_where_they_differ(visit: Visit, files: dict[str, bytes]) -> None:
+def test_options_are_sent_where_they_differ(
+    visit: Visit, files: dict[str, bytes], tmp_path: Path
+) -> None:
     page = visit.open()
-    page.set_input_files(
-        "#files",
-        [
-            {
-                "name": "w.npy",
-                "mimeType": "application/octet-stream",
-                "buffer": files["tracks.npy"],
-            }
-        ],
-    )
+    chosen = tmp_path / "w.npy"
+    chosen.write_bytes(files["tracks.npy"])
+    page.set_input_files("#files", chosen)
     page.get_by_label("Camera model").select_option("relaxed")
     page.get_by_text("More options").click()
     page.get_by_label("Basis size").fill("4")
-    with page.expect_request(lambda request: request.method == "POST") as sent:
-        page.get_by_role("button", name="Send").click()
-    body = sent.value.post_data_buffer
-    assert body is not None
-    assert b'{"camera_model":"relaxed","basis_size":4}' in body
+    page.get_by_role("button", name="Send").click()
     page.wait_for_selector(".viewer[data-loaded]")
+    job = httpx.get(f"{visit.api.url}/v1/jobs/{page.url.rpartition('/')[2]}").json()
+    assert (job["options"]["camera_model"], job["options"]["basis_size"]) == ("relaxed", 4)
+    assert job["options"]["shape_iterations"] == 1000
 
 
 def test_the_surface_moves_and_time_can_be_scrubbed(visit: Visit, job: dict[str, Any]) -> None:
@@ -430,20 +424,20 @@ def test_a_key_is_asked_for_where_one_is_needed(
     browser: Browser,
     page_built: Path,
     files: dict[str, bytes],
-    tmp_path: Path,
-    api_redis: RedisProcess,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    settings = settings_for(tmp_path, api_redis, access="keys")
-    _, secret = KeyStore(api_redis.client()).create("ada")
     assert page_built.is_dir()
-    with (
-        WorkerPool(settings, 1),
-        api_running(settings, api_redis, tmp_path / "api.log") as guarded,
-        visiting(browser, guarded) as visit,
-    ):
+    folder = tmp_path_factory.mktemp("keys")
+    with contextlib.ExitStack() as stack:
+        redis = stack.enter_context(redis_running(folder))  # no worker of another test takes jobs
+        settings = settings_for(folder, redis, access="keys")
+        _, secret = KeyStore(redis.client()).create("ada")
+        stack.enter_context(WorkerPool(settings, 1))
+        guarded = stack.enter_context(api_running(settings, redis, folder / "api.log"))
+        visit = stack.enter_context(visiting(browser, guarded))
         visit.refusals_expected = True
         page = visit.open()
-        page.get_by_label("API key").fill("smsr_wrong")
+        page.get_by_label("wants an API key").fill("smsr_wrong")
         page.get_by_role("button", name="Use it").click()
         expect(page.locator(".key-form")).to_contain_text("does not take this key")
         page.locator("#key-input").fill(secret)

@@ -2,7 +2,7 @@
 
 import type { Option } from "./api";
 import { h } from "./dom";
-import { label, significant } from "./format";
+import { label } from "./format";
 
 /** Options that stand in the open; the others wait behind "More options". */
 const COMMON = ["preset", "layout", "missing", "outliers", "camera_model"];
@@ -98,5 +98,5 @@ function field(option: Option, changed: () => void) {
 
 function placeholder({ default: value, type }: Option): string {
   if (value === null) return type === "string" ? "" : "automatic";
-  return typeof value === "number" ? significant(value, 6) : String(value);
+  return String(value);
 }

@@ -108,7 +108,7 @@ void main() {
   if (n.z < 0.0) n = -n; // both sides are lit alike
   float key = max(dot(n, normalize(vec3(-0.45, 0.6, 0.75))), 0.0);
   float shine = pow(max(dot(n, normalize(vec3(-0.25, 0.35, 1.0))), 0.0), 40.0);
-  gl_FragColor = vec4(tint * (0.38 + 0.62 * key) + 0.10 * shine, 1.0);
+  gl_FragColor = vec4(tint * (0.55 + 0.45 * key) + 0.10 * shine, 1.0);
 }`;
 
 const PLAIN = new Vector3(0.6, 0.74, 0.9);
@@ -117,6 +117,8 @@ const TRUTH = new Vector3(1.0, 0.62, 0.25);
 const PATH_RADII = 1.8;
 /** Points whose values stand for all where a range of colours is looked for. */
 const SAMPLE = 2000;
+/** Part of all distances that the colours tell apart: a jump in one frame must not pale the rest. */
+const LONG_TAIL = 0.985;
 
 interface Stored {
   position: BufferAttribute;
@@ -271,8 +273,10 @@ export class Scene {
       const R = this.rotations[k];
       return R[6] * X[i] + R[7] * X[i + 1] + R[8] * X[i + 2];
     });
-    const motion = this.rangeOf((k, i, X) =>
-      distance(X, this.array(k === 0 ? Math.min(1, this.frames.length - 1) : k - 1), i),
+    const motion = this.rangeOf(
+      (k, i, X) =>
+        distance(X, this.array(k === 0 ? Math.min(1, this.frames.length - 1) : k - 1), i),
+      LONG_TAIL,
     );
     this.ranges.motion = [0, motion[1] || 1];
     this.draw();
@@ -282,8 +286,9 @@ export class Scene {
     for (const [k, positions] of frames.entries()) {
       this.frames[k].truth = new BufferAttribute(positions, 3);
     }
-    const error = this.rangeOf((k, i, X) =>
-      distance(X, this.frames[k].truth!.array as Float32Array, i),
+    const error = this.rangeOf(
+      (k, i, X) => distance(X, this.frames[k].truth!.array as Float32Array, i),
+      LONG_TAIL,
     );
     this.ranges.error = [0, error[1] || 1];
     this.ask();
@@ -531,10 +536,13 @@ export class Scene {
   }
 
   /** The range that holds all values but a few outliers. */
-  private rangeOf(value: (k: number, i: number, X: Float32Array) => number): [number, number] {
+  private rangeOf(
+    value: (k: number, i: number, X: Float32Array) => number,
+    part = 0.998,
+  ): [number, number] {
     const values = this.sampled(value);
-    const at = (part: number) => values[Math.round(part * (values.length - 1))];
-    return [at(0.002), at(0.998)];
+    const at = (where: number) => values[Math.round(where * (values.length - 1))];
+    return [at(1 - part), at(part)];
   }
 
   private resize(): void {

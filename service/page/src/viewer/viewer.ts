@@ -21,7 +21,7 @@ const COLOURINGS: Record<Colouring, string> = {
 };
 const LEGENDS: Record<Colouring, string> = {
   depth: "Depth from the camera, in the unit of the tracks",
-  motion: "3D motion from frame to frame, in the unit of the tracks",
+  motion: "3D motion in a frame, in the unit of the tracks",
   error: "Distance from the ground truth, in σ (as e3D)",
   plain: "",
 };
@@ -401,7 +401,7 @@ class Viewer {
       this.decimation = `Shows ${parts.join(" and ")} of this large result (${size}).`;
       this.tell(this.decimation);
     }
-    const suggested = shown < 120 ? 9 : shown < 2500 ? 5 : shown < 25_000 ? 3 : 2;
+    const suggested = shown < 120 ? 9 : shown < 2500 ? 6 : shown < 25_000 ? 3 : 2;
     scene.look.pointSize = suggested;
     if (this.sizeInput) this.sizeInput.value = String(suggested);
   }
