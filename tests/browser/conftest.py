@@ -38,10 +38,10 @@ FLAGS = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    "--use-angle=swiftshader",
+    "--disable-gpu",
     "--enable-unsafe-swiftshader",
 ]
-"""WebGL by the processor, and no connections that the page did not ask for."""
+"""Everything drawn by the processor, and no connections that the page did not ask for."""
 
 
 def find_chromium() -> str | None:

@@ -560,14 +560,16 @@ export class Scene {
   private measure(): void {
     const now = performance.now();
     this.pictures.push(now);
-    while (now - this.pictures[0] > 1500) this.pictures.shift();
-    if (now - this.adapted < 750 || this.pictures.length < 5) return;
+    while (this.pictures.length > 2 && now - this.pictures[0] > 1500) this.pictures.shift();
+    const pictures = this.pictures.length;
+    if (now - this.adapted < 750 || pictures < 2 || (pictures < 5 && now - this.adapted < 1500))
+      return;
     this.adapted = now;
     this.rate = (1000 * (this.pictures.length - 1)) / (now - this.pictures[0]);
     if (!(this.look.mesh && this.hasFaces) && !this.look.whole) {
       const before = this.detail;
       if (this.rate < 28) this.detail = Math.max(0.05, this.detail * Math.max(0.5, this.rate / 34));
-      else if (this.rate > 50) this.detail = Math.min(1, this.detail * 1.25);
+      else if (this.rate > 38) this.detail = Math.min(1, this.detail * 1.25);
       if (this.detail !== before) this.pictures.length = 0;
     }
     this.onmeasure();
