@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 _RECONNECT_SECONDS = 1.0
 _LOOK_ANYWAY_SECONDS = 10.0
 """A waiter looks this often even when nothing was announced."""
+_READS_AT_ONCE = 32
+"""Fewer than the connections of a client's pool, which refuses more instead of waiting."""
 
 log = structlog.get_logger(__name__)
 
@@ -66,6 +68,7 @@ class ChangeFeed:
         self.redis = redis
         self._waiting: dict[str, set[asyncio.Event]] = {}
         self._inboxes: set[_Inbox] = set()
+        self._reading = asyncio.Semaphore(_READS_AT_ONCE)
         self._fetches: dict[str, asyncio.Task[JobRecord | None]] = {}
         self._listener: asyncio.Task[None] | None = None
 
@@ -86,8 +89,9 @@ class ChangeFeed:
 
     async def get(self, job_id: str) -> JobRecord | None:
         """Return a record, or None when there is no such job."""
-        answer = cast("Awaitable[dict[bytes, bytes]]", self.redis.hgetall(record_key(job_id)))
-        return decode(job_id, await answer)
+        async with self._reading:
+            answer = cast("Awaitable[dict[bytes, bytes]]", self.redis.hgetall(record_key(job_id)))
+            return decode(job_id, await answer)
 
     async def wait(self, job_id: str, version: int, timeout: float) -> JobRecord | None:
         """Return the record as soon as its version differs, or as it is when time is up.
