@@ -175,7 +175,8 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     values = points.values / unit
     virtual = points.left * values
     with clock.stage("cameras") as hook:
-        estimate = estimate_cameras(points.left, values, options, hook, denoised=points.noise > 0.0)
+        noise = points.noise / _spread(space)
+        estimate = estimate_cameras(points.left, values, options, hook, noise=noise)
         rotations = fix_gauge(estimate.rotations)
         clock.note(estimate)
     with clock.stage("smoothing") as hook:
@@ -190,6 +191,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             options,
             camera_model=estimate.model,
             coherent=estimate.coherent,
+            simpler=estimate.simpler,
             hook=hook,
         )
         clock.note(found)
@@ -216,6 +218,12 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             *convergence_cautions(clock.reports),
         ),
     )
+
+
+def _spread(space: RowSpace) -> float:
+    """Return the root mean square of the centred measurements."""
+    positions = 2 * space.frames * space.points
+    return math.sqrt(float((space.singular_values**2).sum()) / positions)
 
 
 def _smooth(

@@ -267,6 +267,7 @@ def estimate_shapes(
     *,
     camera_model: str = "relaxed",
     coherent: bool = False,
+    simpler: NDArray[np.float64] | None = None,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
     """Find the shapes of all frames in the way that the options ask for.
@@ -282,7 +283,9 @@ def estimate_shapes(
     camera_model : str
         How the cameras were found: 'rigid' says that the object is.
     coherent : bool
-        See `motion_scale`.
+        See `reweighted_shapes`.
+    simpler : ndarray of shape (T, 3, 3), optional
+        See `smsr.cameras.CameraEstimate.simpler`.
     hook : callable
         See `smsr.progress.StageHook`.
     """
@@ -303,10 +306,18 @@ def estimate_shapes(
         return low_rank_shapes(measurements, rotations, **limits)
     if options.shape_method == "auto" and camera_model == "rigid":
         return rigid_shapes(measurements, rotations)
-    found = reweighted_shapes(
-        measurements, rotations, motion_weight=options.motion_weight, coherent=coherent, **limits
-    )
-    return found if options.shape_method == "reweighted" else credible_depth(found, rotations)
+    limits["motion_weight"] = options.motion_weight
+    found = reweighted_shapes(measurements, rotations, coherent=coherent, **limits)
+    if options.shape_method == "reweighted":
+        return found
+    if simpler is not None:
+        other = reweighted_shapes(measurements, simpler, **limits)
+        found = with_mean_depth(found, rotations, other, simpler)
+    found = credible_depth(found, rotations)
+    if found.complexity < DOUBTFUL:
+        return found
+    deep = reweighted_shapes(measurements, rotations, deep=True, **limits)
+    return with_deep_shapes(found, deep, rotations)
 
 
 def low_rank_shapes(
@@ -405,6 +416,7 @@ def reweighted_shapes(
     *,
     motion_weight: float = 1.0,
     coherent: bool = False,
+    deep: bool = False,
     max_iterations: int = 1000,
     tolerance: float = 1e-4,
     hook: StageHook = ignore,
@@ -424,13 +436,20 @@ def reweighted_shapes(
         Lambda relative to ``motion_scale ||P S#||_* / ||D S#||^2``, so it does not depend on
         units, frames or points; 0 for no motion term.
     coherent : bool
-        See `motion_scale`; with coherent cameras that turn fast eps is smaller, too.
+        The cameras follow a simple path, and that path made the object move no more: then motion
+        that flickers is taken for an error, see `flicker`, and eps is smaller where they turn fast.
+    deep : bool
+        Enter the problem from the shapes of least motion instead, which have all the depth that
+        the minimum of the nuclear norm has.
     """
     problem = DepthProblem(measurements, rotations)
-    first = min(_FIRST_ITERATIONS, max_iterations)
+    if deep:
+        problem.start_from_least_motion()
+    first = min(_DEEP_FIRST_ITERATIONS if deep else _FIRST_ITERATIONS, max_iterations)
     converged = problem.minimise(first, tolerance, part_of(hook, 0.0, 1 / (_ROUNDS + 1)))
     complexity = problem.complexity()
     offset = by_turn_speed(rotations, *_LOG_OFFSETS) if coherent else _LOG_OFFSETS[0]
+    by_flicker = flicker(problem) if coherent else 0.0
     scale = 0.0
     for index in range(_ROUNDS):
         spectrum, motion = problem.spectrum(), problem.motion()
@@ -439,7 +458,7 @@ def reweighted_shapes(
         if left < 1 or nuclear <= _RIGID * float(np.linalg.norm(problem.shapes)):
             break
         if index < _SCALED_ROUNDS and motion_weight > 0.0:
-            scale = motion_weight * motion_scale(problem, coherent=coherent)
+            scale = motion_weight * motion_scale(problem, by_flicker)
         problem.motion_weight = scale * nuclear / max(motion, 1e-12 * nuclear)
         weights = 1.0 / (spectrum + offset * spectrum[0])
         problem.weights = weights * (nuclear / float(weights @ spectrum))
@@ -450,6 +469,7 @@ def reweighted_shapes(
 
 
 _FIRST_ITERATIONS = 30
+_DEEP_FIRST_ITERATIONS = 150
 _ROUNDS = 5
 _SCALED_ROUNDS = 2
 _ITERATIONS_PER_ROUND = 40
@@ -458,36 +478,68 @@ _RIGID = 1e-6
 
 _RATIO = 15.0
 _BY_RATIO = 0.7
-_BY_HASTE = (1.0, 21.0)
+_COMMON_HASTE = 0.012  # of a smooth motion with a period of 40 frames
+_BY_HASTE = 50.0
 _MOST_BY_HASTE = 2.0
+_EXCESS = 0.1
 _FAST_TURN = (math.radians(1.0), math.radians(2.0))
 
 
-def motion_scale(problem: DepthProblem, *, coherent: bool) -> float:
+def motion_scale(problem: DepthProblem, by_flicker: float = 0.0) -> float:
     """Return how strongly least motion is asked for, given the shapes found so far.
 
     Least motion settles what the camera's turn leaves open, and does harm where the object itself
     moves. So it is asked for in two cases: where the image moves much more than the shape, which
     then is the camera's doing; and, with coherent cameras, where the estimated motion changes its
-    direction from frame to frame as a real one does not. The second counts in full where the
-    camera turns fast, so that neighbouring frames see depth from different sides.
+    direction from frame to frame as the tracks do not.
 
     Parameters
     ----------
     problem : DepthProblem
         With the shapes.
-    coherent : bool
-        The cameras follow a simple path, and that path made the object move less.
+    by_flicker : float
+        Weight of the second case, see `flicker`.
     """
-    steps = np.diff(problem.shapes, axis=0)
-    motion = max(float((steps**2).sum()), np.finfo(float).tiny)
+    motion = max(problem.motion(), np.finfo(float).tiny)
     ratio = max(problem.image_motion() / motion, np.finfo(float).tiny)
-    scale = _BY_RATIO * max(0.0, math.log(ratio / _RATIO))
-    if not coherent:
-        return scale
-    haste = 1.0 - float((steps[1:] * steps[:-1]).sum()) / motion
-    weight = by_turn_speed(problem.rotations, *_BY_HASTE) * haste
-    return max(scale, min(_MOST_BY_HASTE, weight) * max(0.0, math.log(ratio)))
+    by_ratio = _BY_RATIO * max(0.0, math.log(ratio / _RATIO))
+    return max(by_ratio, by_flicker * max(0.0, math.log(ratio)))
+
+
+def flicker(problem: DepthProblem) -> float:
+    """Return how much of the estimated motion is flicker of the depths, as a weight from 0 to 2.
+
+    Haste is how much of a step is undone or turned aside by the next, 0 in a steady motion. Taken
+    as the median over the frames, it passes over abrupt moments, which a real object may have.
+    Depths that are more hasty than the motion across the viewing direction, which the tracks bear
+    out, flicker; where they are not, the object itself is hasty. All of this counts where the
+    camera turns so fast that neighbouring frames see depth from different sides.
+
+    Parameters
+    ----------
+    problem : DepthProblem
+        With shapes found by the nuclear norm alone.
+    """
+    frames = problem.frames
+    steps = np.diff(problem.shapes, axis=0).reshape(frames - 1, 3, -1)
+    axes = problem.axis[1:] + problem.axis[:-1]
+    axes = axes / np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), np.finfo(float).tiny)
+    depths = np.matmul(axes[:, None], steps)
+    across = _haste(steps - axes[:, :, None] * depths)
+    excess = (_haste(depths) - across) / max(across, np.finfo(float).tiny)
+    sure = min(max(excess / _EXCESS, 0.0), 1.0)
+    slope = by_turn_speed(problem.rotations, 0.0, _BY_HASTE)
+    return sure * min(_MOST_BY_HASTE, slope * max(0.0, _haste(steps) - _COMMON_HASTE))
+
+
+def _haste(steps: NDArray[np.float64]) -> float:
+    """Return the haste of a motion (T - 1, ...), see `flicker`."""
+    if len(steps) < 2:
+        return 0.0
+    steps = steps.reshape(len(steps), -1)
+    squares = (steps**2).sum(axis=1)
+    sizes = np.maximum(0.5 * (squares[1:] + squares[:-1]), np.finfo(float).tiny)
+    return float(np.median(1.0 - (steps[1:] * steps[:-1]).sum(axis=1) / sizes))
 
 
 def by_turn_speed(rotations: NDArray[np.float64], slow: float, fast: float) -> float:
@@ -523,6 +575,87 @@ def rigid_shapes(
         iterations=0,
         converged=True,
         reason="one shape for all frames",
+    )
+
+
+DOUBTFUL = 0.7
+"""Complexity above which the way into the problem decides on the depth."""
+
+_DEEP = (0.75, 0.85)  # complexities between which the deep shapes lose their part
+_PART_OF_DEEP = 0.6
+
+
+def with_deep_shapes(
+    estimate: ShapeEstimate, deep: ShapeEstimate, rotations: NDArray[np.float64]
+) -> ShapeEstimate:
+    """Return shapes between those entered from flat and those entered from deep ones.
+
+    Where the camera turns little, the nuclear norm hardly changes between the two, and one has too
+    little depth and the other often too much. Deep shapes count as far as they make the shapes
+    simpler, and with no more depth than the object is wide.
+
+    Parameters
+    ----------
+    estimate, deep : ShapeEstimate
+        Entered from flat shapes and from those of least motion.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    """
+    low, high = _DEEP
+    part = _PART_OF_DEEP * min(max((high - deep.complexity) / (high - low), 0.0), 1.0)
+    if part == 0.0:
+        return estimate
+    seen = rotations @ deep.shapes
+    depth = math.sqrt(float((seen[:, 2] ** 2).mean()))
+    image = seen[:, :2].transpose(1, 0, 2).reshape(2, -1)
+    width = float(np.linalg.norm(image, 2)) / math.sqrt(seen[:, 2].size)
+    depths = min(1.0, width / max(depth, np.finfo(float).tiny)) * seen[:, 2]
+    axis = rotations[:, 2]
+    present = np.matmul(axis[:, None], estimate.shapes)[:, 0]
+    change = part * (depths - present)
+    return dataclasses.replace(
+        estimate,
+        shapes=estimate.shapes + axis[:, :, None] * change[:, None],
+        iterations=estimate.iterations + deep.iterations,
+        converged=estimate.converged and deep.converged,
+        reason=f"{estimate.reason}; {part:.0%} of shapes with full depth: {deep.reason}",
+    )
+
+
+def with_mean_depth(
+    estimate: ShapeEstimate,
+    rotations: NDArray[np.float64],
+    other: ShapeEstimate,
+    others: NDArray[np.float64],
+) -> ShapeEstimate:
+    """Return shapes with the mean of the depths that two sets of cameras see.
+
+    An object that turns as a whole looks simpler to cameras that turn with it. Their depths are
+    then the better ones, though their path is not the camera's.
+
+    Parameters
+    ----------
+    estimate : ShapeEstimate
+        Found with `rotations`.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    other : ShapeEstimate
+        Found with `others`.
+    others : ndarray of shape (T, 3, 3)
+        Other cameras for the same tracks, perhaps mirrored.
+    """
+    axis = rotations[:, 2]
+    depths = np.matmul(axis[:, None], estimate.shapes)[:, 0]
+    seen = np.matmul(others[:, 2][:, None], other.shapes)[:, 0]
+    if float((depths * seen).sum()) < 0.0:
+        seen = -seen
+    change = 0.5 * (seen - depths)
+    return dataclasses.replace(
+        estimate,
+        shapes=estimate.shapes + axis[:, :, None] * change[:, None],
+        iterations=estimate.iterations + other.iterations,
+        converged=estimate.converged and other.converged,
+        reason=f"{estimate.reason}; free cameras, mean of the depths: {other.reason}",
     )
 
 

@@ -18,6 +18,7 @@ from smsr.benchmark import (
     METHODS,
     PUBLISHED,
     best_published,
+    camera_paths,
     environment,
     run,
     select,
@@ -28,9 +29,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from smsr.benchmark import Dataset, Environment, Figure, Measurement
+    from smsr.benchmark.camera_paths import Key, Member
 
 MEBIBYTE = 1 << 20
 OURS = "this code"
+NOISES = ",".join(f"{noise:g}" for noise in camera_paths.NOISES)
 
 
 def benchmark(
@@ -57,13 +60,26 @@ def benchmark(
             metavar="NAME=VALUE", help="Measure with this option too, as a row more; repeatable."
         ),
     ] = None,
+    paths: Annotated[
+        str | None,
+        typer.Option(
+            "--camera-paths",
+            metavar="NAMES",
+            help="Then measure the true shapes of the sets under generated camera paths, too: "
+            "comma-separated names, or 'all'.",
+        ),
+    ] = None,
+    noises: Annotated[
+        str, typer.Option(metavar="PARTS", help="Noise on the camera paths, parts of the extent.")
+    ] = NOISES,
     threads: Annotated[int, typer.Option(min=1, help="BLAS threads.")] = 1,
     as_json: AsJson = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown tables.")] = False,
 ) -> None:
     """Measure e3D, wall time and peak memory on each set, beside the published figures.
 
-    Each set runs in a process of its own, one after the other.
+    Each set runs in a process of its own, one after the other; the members of the family of camera
+    paths run with the default options, two at a time.
     """
     values = preset_and_options(Options, preset, option)
     variants = {"": values}
@@ -72,7 +88,9 @@ def benchmark(
     for options in variants.values():
         parse(Options, options)
     chosen = DATASETS if sets is None else select(name.strip() for name in sets.split(","))
+    family = _family(None if sets is None else [one.name for one in chosen], paths, noises)
     measured: dict[str, list[Measurement]] = {}
+    members: list[Member] = []
     with progress_bars() as bars:
         bar = bars.add_task("measuring", total=len(variants) * len(chosen), stage="")
         for variant, options in variants.items():
@@ -81,6 +99,11 @@ def benchmark(
                 bars.update(bar, stage=f"{dataset.name} {variant}")
                 measured[variant].append(run(dataset, data, options=options, threads=threads))
                 bars.advance(bar)
+        bars.update(bar, stage="")
+        bar = bars.add_task("camera paths", total=len(family), stage="", visible=bool(family))
+        for member in camera_paths.measure_members(data, family, processes=2) if family else ():
+            members.append(member)
+            bars.update(bar, advance=1, stage=f"{member.path} {member.shape}")
         bars.update(bar, stage="")
     where = environment(threads)
     if as_json:
@@ -93,19 +116,54 @@ def benchmark(
                     variant: [dataclasses.asdict(one) for one in sets_of_it]
                     for variant, sets_of_it in measured.items()
                 },
+                "camera_paths": [dataclasses.asdict(one) for one in members],
             }
         )
         return
     accuracy, cost = accuracy_rows(chosen, measured), cost_rows(measured[""])
     if markdown:
-        text = "\n\n".join((_markdown(accuracy), _markdown(cost), footnote(where, measured[""])))
+        parts = [_markdown(accuracy), _markdown(cost)]
+        if members:
+            losses = [f"- {line}" for line in camera_paths.lost_lines(members)]
+            parts += [_markdown(camera_paths.rows(members)), "\n".join([_losses(members), *losses])]
+        text = "\n\n".join((*parts, footnote(where, measured[""])))
         console.print(text, markup=False, soft_wrap=True)
         return
     console.print(_table(accuracy))
     console.print(_table(cost))
+    if members:
+        console.print(_table(camera_paths.rows(members)))
+        console.print(_losses(members))
+        for line in camera_paths.lost_lines(members):
+            console.print(line)
     console.print(footnote(where, measured[""]), style="dim")
     for method, source in METHODS.items():
         console.print(f"{method}: {source}", style="dim")
+
+
+def _family(sets: Sequence[str] | None, paths: str | None, noises: str) -> list[Key]:
+    """Return the members of the family of camera paths that are asked for."""
+    if paths is None:
+        return []
+    known = camera_paths.PATHS
+    names = list(known) if paths == "all" else [name.strip() for name in paths.split(",")]
+    for name in names:
+        if name not in known:
+            raise typer.BadParameter(f"There is no camera path {name!r}: {', '.join(known)}.")
+    try:
+        levels = [float(level) for level in noises.split(",")]
+    except ValueError:
+        raise typer.BadParameter(f"Noises are numbers, not {noises!r}.") from None
+    shapes = [name for name in camera_paths.SHAPES if sets is None or name in sets]
+    return camera_paths.keys(shapes, names, levels)
+
+
+def _losses(members: Sequence[Member]) -> str:
+    count = len(camera_paths.lost(members))
+    return (
+        f"{count} of {len(members)} lose more than {camera_paths.LOSS - 1:.0%} against one "
+        "relaxation and the nuclear norm."
+    )
 
 
 def accuracy_rows(

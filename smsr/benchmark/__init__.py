@@ -1,5 +1,6 @@
 """Accuracy, time and memory on public evaluation sets, beside the published figures."""
 
+from smsr.benchmark import camera_paths
 from smsr.benchmark.datasets import DATASETS, Dataset, load, select
 from smsr.benchmark.measure import (
     BenchmarkFailed,
@@ -21,6 +22,7 @@ __all__ = [
     "Figure",
     "Measurement",
     "best_published",
+    "camera_paths",
     "environment",
     "load",
     "measure",

@@ -40,6 +40,9 @@ class CameraEstimate:
         `smsr.cameras.selection`.
     coherent : bool
         Whether a simple path of the camera made the object move no more.
+    simpler : ndarray of shape (T, 3, 3), optional
+        The free cameras that gave way to a simple path, in a frame of their own and perhaps
+        mirrored, where the shapes that they give are clearly simpler: they turn with the object.
     """
 
     rotations: NDArray[np.float64]
@@ -51,6 +54,7 @@ class CameraEstimate:
     residuals: tuple[float, ...] = ()
     criteria: Mapping[str, float] = field(default_factory=dict)
     coherent: bool = False
+    simpler: NDArray[np.float64] | None = None
 
 
 def scaled_motion(

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 RELAXATIONS = ((10, 1e-3), (3, 1e-3), (2, 1e-3), (10, 4e-3), (10, 1.6e-2))
 """Basis size and trace weight of the relaxations that are tried; mostly the first is right."""
 
+_CLEAN_WEIGHT = 2.5e-4  # of the first relaxation
+_NOISY = 0.02  # noise, as a part of the tracks' spread, from which on its weight is the full one
+
 _CERTAIN = 0.3
 """Complexity below which the first relaxation is right and no other is tried."""
 
@@ -49,6 +52,7 @@ def free_cameras(
     values: NDArray[np.float64],
     *,
     basis_size: int | None = None,
+    noise: float = 0.0,
     max_iterations: int = 500,
     tolerance: float = 1e-6,
     hook: StageHook = ignore,
@@ -63,6 +67,10 @@ def free_cameras(
         Singular values, largest first.
     basis_size : int, optional
         K, where it is known: then there is one relaxation only.
+    noise : float
+        Noise that was taken off, as a part of the tracks' spread. The trace shortens the depth
+        that cameras see and lets them drift, but steadies them where the tracks are uncertain: the
+        less noise, the less weight of the trace in the first relaxation.
     max_iterations, tolerance, hook
         As for `smsr.cameras.relaxed.relaxed_cameras`.
 
@@ -75,7 +83,10 @@ def free_cameras(
     most = max(1, len(values) // 3)
     settings = [(basis_size or 10, RELAXATIONS[0][1])]
     if basis_size is None:
-        settings = list(dict.fromkeys((min(K, most), weight) for K, weight in RELAXATIONS))
+        share = min(noise / _NOISY, 1.0) ** 2
+        first = (RELAXATIONS[0][0], max(_CLEAN_WEIGHT, RELAXATIONS[0][1] * share))
+        tried = (first, *RELAXATIONS[1:])
+        settings = list(dict.fromkeys((min(K, most), weight) for K, weight in tried))
     largest = usable_rank(values, 3 * max(K for K, _ in settings))
     form = orthonormality_form(scaled_motion(left, values, largest), unit_scale=True)
     found: list[CameraEstimate] = []

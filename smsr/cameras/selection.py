@@ -46,6 +46,9 @@ MOTION_RISE_LIMIT = 0.35
 COHERENT_RISE = 0.03
 """Up to this much more motion is no more, see `CameraEstimate.coherent`."""
 
+CLEARLY_SIMPLER = 0.85
+"""Part of the nuclear norm on a path below which free cameras give clearly simpler shapes."""
+
 SPAN_LIMIT = 0.06
 """Most of a path that may lie outside the leading left singular vectors of W, unless more of the
 free cameras does."""
@@ -69,7 +72,7 @@ def estimate_cameras(
     options: Options,
     hook: StageHook = ignore,
     *,
-    denoised: bool = False,
+    noise: float = 0.0,
 ) -> CameraEstimate:
     """Find the cameras of all frames in the way that the options ask for.
 
@@ -83,8 +86,9 @@ def estimate_cameras(
         Resolved by `smsr.options.resolve`.
     hook : callable
         See `smsr.progress.StageHook`.
-    denoised : bool
-        Weak directions of the measurements went with their noise.
+    noise : float
+        Standard deviation of the noise that was taken off, as a part of the tracks' spread; 0 for
+        none.
     """
     if options.camera_model == "paper":
         return published_cameras(
@@ -102,6 +106,7 @@ def estimate_cameras(
         left,
         values,
         basis_size=options.basis_size,
+        noise=noise,
         max_iterations=options.camera_iterations,
         tolerance=options.camera_tolerance,
         hook=part_of(hook, 0.0, 0.5),
@@ -113,7 +118,7 @@ def estimate_cameras(
         left * values,
         part_of(hook, 0.5, 1.0),
         force=options.camera_model == "uniform",
-        denoised=denoised,
+        denoised=noise > 0.0,
     )
 
 
@@ -192,6 +197,7 @@ def with_simple_path(
             model=name,
             criteria=criteria,
             coherent=(verdict.motion_rise or 0.0) <= COHERENT_RISE,
+            simpler=free.rotations if verdict.free_simplicity < CLEARLY_SIMPLER else None,
             reason=f"a {name} turn of {speed:.2f} degrees a frame {verdict.reason}; {free.reason}",
         )
     return dataclasses.replace(free, criteria=criteria, reason="; ".join([*refusals, free.reason]))
@@ -231,6 +237,7 @@ class _Verdict:
     reason: str
     motion_rise: float | None = None
     motion_weight: float | None = None
+    free_simplicity: float = 1.0  # nuclear norm with the free cameras over that on the path
 
 
 class _Trial:
@@ -253,6 +260,7 @@ class _Trial:
         self.rotations = rotations
         self.step = step
         self._free_motion: float | None = None
+        self._free_nuclear = 0.0
 
     def judge(self, turn: Turn) -> _Verdict:
         """Add to a path the shake of the cameras and put it to the tests."""
@@ -273,7 +281,9 @@ class _Trial:
         """Measure the shapes that a path gives, and accept it."""
         tiny = np.finfo(float).tiny
         if self._free_motion is None:
-            self._free_motion = max(self._solve(self.rotations[:: self.step]).motion(), tiny)
+            free = self._solve(self.rotations[:: self.step])
+            self._free_motion = max(free.motion(), tiny)
+            self._free_nuclear = float(free.spectrum().sum())
         problem = self._solve(turn.every(self.step).rotations)
         motion = max(problem.motion(), tiny)
         gain = max(0.0, math.log(max(problem.image_motion(), tiny) / motion))
@@ -286,6 +296,7 @@ class _Trial:
             f"object by {math.expm1(rise):+.0%}",
             rise,
             _MOTION_WEIGHT * gain * nuclear / motion,
+            self._free_nuclear / max(nuclear, tiny),
         )
 
     def _solve(self, rotations: NDArray[np.float64]) -> DepthProblem:

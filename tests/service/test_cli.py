@@ -369,6 +369,27 @@ def test_benchmark_measures_a_set_in_its_own_process(evaluation_data: Path) -> N
     assert report["environment"]["blas_threads"] == 1
 
 
+@pytest.mark.data
+def test_benchmark_measures_camera_paths(evaluation_data: Path) -> None:
+    family = ("--camera-paths", "fast,tripod", "--noises", "0.05")
+    run = smsr("benchmark", "--data", evaluation_data, "--sets", "yoga", *family, "--json")
+    fast, tripod = json.loads(succeeded(run))["camera_paths"]
+    assert [(one["shape"], one["path"], one["noise"]) for one in (fast, tripod)] == [
+        ("yoga", "fast", 0.05),
+        ("yoga", "tripod", 0.05),
+    ]
+    assert fast["default"]["object"] < 0.5 * fast["baseline"]["object"]
+    table = smsr("benchmark", "--data", evaluation_data, "--sets", "yoga", *family, "--markdown")
+    assert "| 5% | fast |" in succeeded(table)
+
+
+@pytest.mark.data
+def test_benchmark_refuses_an_unknown_camera_path(evaluation_data: Path) -> None:
+    run = smsr("benchmark", "--data", evaluation_data, "--camera-paths", "zigzag")
+    assert run.returncode == 2
+    assert "lissajous" in run.stderr
+
+
 def until(condition: Any, seconds: float = 30.0) -> None:
     deadline = time.monotonic() + seconds
     while not condition():

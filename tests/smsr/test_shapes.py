@@ -9,14 +9,18 @@ import pytest
 from smsr import rotations as so3
 from smsr.shapes import (
     DepthProblem,
+    ShapeEstimate,
     basis_size_of,
     credible_depth,
+    flicker,
     low_rank_shapes,
     motion_scale,
     planar_shapes,
     published_shapes,
     reweighted_shapes,
     rigid_shapes,
+    with_deep_shapes,
+    with_mean_depth,
 )
 
 if TYPE_CHECKING:
@@ -222,27 +226,80 @@ class TestReweighted:
 
 
 class TestMotionScale:
-    def problem(self, turn: float, wobble: float = 0.0) -> DepthProblem:
+    def problem(self, turn: float, flicker: float = 0.0, shaking: float = 0.0) -> DepthProblem:
         """A slowly stretching shape under a camera that turns by so many radians a frame."""
         rng = np.random.default_rng(0)
         shape = rng.standard_normal((3, 20))
         time = np.arange(60)[:, None, None]
-        shapes = shape * (1.0 + 1e-3 * time) + wobble * rng.standard_normal((60, 3, 20))
         rotations = so3.exp(turn * np.arange(60)[:, None] * np.array([0.0, 1.0, 0.0]))
+        shapes = shape * (1.0 + 1e-3 * time) + shaking * rng.standard_normal((60, 3, 20))
         problem = DepthProblem((rotations @ shapes)[:, :2].reshape(120, 20), rotations)
-        problem.shapes = shapes.reshape(60, -1)
+        depths = flicker * rng.standard_normal((60, 1, 20))
+        problem.shapes = (shapes + rotations[:, 2][:, :, None] * depths).reshape(60, -1)
         return problem
 
     def test_the_more_the_camera_turns_the_more_weight(self) -> None:
-        scales = [motion_scale(self.problem(turn), coherent=False) for turn in (0.0, 0.01, 0.1)]
+        scales = [motion_scale(self.problem(turn)) for turn in (0.0, 0.01, 0.1)]
         assert scales[0] == 0.0
         assert scales == sorted(scales)
         assert scales[2] > scales[1]
 
-    def test_hasty_motion_counts_only_under_coherent_cameras_that_turn_fast(self) -> None:
-        slow, fast = self.problem(0.01, wobble=0.02), self.problem(0.06, wobble=0.02)
-        assert motion_scale(fast, coherent=False) == 0.0
-        assert motion_scale(fast, coherent=True) > motion_scale(slow, coherent=True)
+    def test_flicker_adds_to_it_where_the_image_moves_more_than_the_shape(self) -> None:
+        problem = self.problem(0.06, flicker=0.02)
+        assert motion_scale(problem, 1.0) > motion_scale(problem)
+
+    def test_flicker_counts_under_cameras_that_turn_fast(self) -> None:
+        assert flicker(self.problem(0.01, flicker=0.02)) == 0.0
+        assert flicker(self.problem(0.06, flicker=0.02)) > 0.0
+
+    def test_an_object_that_shakes_in_all_directions_does_not_flicker(self) -> None:
+        across = flicker(self.problem(0.06, shaking=0.2))
+        assert across < 0.5 * flicker(self.problem(0.06, flicker=0.2))
+
+    def test_two_frames_have_no_haste(self) -> None:
+        W, rotations, _ = sequence(frames=2)
+        assert flicker(DepthProblem(W, rotations)) == 0.0
+
+
+class TestTwoSolutions:
+    def estimates(self, complexity: float) -> tuple[Array, Array, ShapeEstimate, ShapeEstimate]:
+        """Return W, cameras, a solution and one with half of its depth and a complexity."""
+        W, rotations, _ = sequence(modes=2)
+        found = low_rank_shapes(W, rotations)
+        less = planar_shapes(W, rotations) + 0.5 * (found.shapes - planar_shapes(W, rotations))
+        return (
+            W,
+            rotations,
+            found,
+            dataclasses.replace(found, shapes=less, complexity=complexity),
+        )
+
+    @pytest.mark.parametrize("complexity", [0.5, 0.8, 0.9])
+    def test_deep_shapes_count_as_far_as_they_are_simple(self, complexity: float) -> None:
+        W, rotations, found, deep = self.estimates(complexity)
+        blend = with_deep_shapes(found, deep, rotations)
+        np.testing.assert_allclose((rotations[:, :2] @ blend.shapes).reshape(W.shape), W, atol=1e-9)
+        moved = np.linalg.norm(blend.shapes - found.shapes)
+        part = moved / np.linalg.norm(deep.shapes - found.shapes)
+        assert part == pytest.approx({0.5: 0.6, 0.8: 0.3, 0.9: 0.0}[complexity], abs=1e-6)
+
+    def test_deep_shapes_are_no_deeper_than_the_object_is_wide(self) -> None:
+        W, rotations, found, deep = self.estimates(0.5)
+        planar = planar_shapes(W, rotations)
+        far = dataclasses.replace(deep, shapes=planar + 1e3 * (deep.shapes - planar))
+        flat = dataclasses.replace(found, shapes=planar)
+        seen = rotations @ with_deep_shapes(flat, far, rotations).shapes
+        width = np.linalg.norm(seen[:, :2].transpose(1, 0, 2).reshape(2, -1), 2)
+        assert np.linalg.norm(seen[:, 2]) == pytest.approx(0.6 * width)
+
+    @pytest.mark.parametrize("mirrored", [False, True])
+    def test_mean_depth_of_the_same_cameras_in_another_frame(self, mirrored: bool) -> None:
+        W, rotations, _ = sequence(modes=2)
+        others = rotations @ so3.exp(np.array([[0.3, -0.2, 0.9]]))
+        others = so3.mirror(others) if mirrored else others
+        found, other = low_rank_shapes(W, rotations), low_rank_shapes(W, others)
+        mean = with_mean_depth(found, rotations, other, others)
+        assert relative_error(mean.shapes, found.shapes) < 1e-3
 
 
 class TestRigid:
