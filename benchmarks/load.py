@@ -34,13 +34,13 @@ from threadpoolctl import threadpool_limits
 
 import smsr
 from benchmarks.scaling import redis_server, service
-from service.client import Client
 from smsr.synthetic import make_low_rank
+from smsr_client import Client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from service.schemas import Job
+    from smsr_client.documents import Job
 
 FRAMES, POINTS = 60, 41
 SENDERS = 4

@@ -28,8 +28,8 @@ import httpx
 import numpy as np
 import redis
 
-from service.client import Client
 from smsr.synthetic import make_low_rank
+from smsr_client import Client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The three floors import only down, and the solver stands on its own."""
+"""The three floors import only down; the solver and the client stand on their own."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ OF_AN_EXTRA = {
     "smsr/devices.py": {"array_api_compat"},
     "smsr/figures.py": {"matplotlib"},
 }
+CLIENT_LIBRARIES = {"anyio", "httpx", "numpy", "pydantic"}
 WEB_LIBRARIES = {"fastapi", "starlette", "uvicorn", "httpx", "typer", "rich", "multipart"}
 
 
@@ -55,6 +56,26 @@ def test_the_solver_needs_arrays_and_file_formats_only() -> None:
         for path, names in everything("smsr").items()
     }
     assert {path: names for path, names in foreign.items() if names} == {}
+
+
+def test_the_client_stands_beside_the_floors() -> None:
+    """It could be installed alone; the service shares its documents, the worker nothing."""
+    allowed = CLIENT_LIBRARIES | set(sys.stdlib_module_names) | {"smsr_client"}
+    found = everything("smsr_client")
+    assert found
+    assert {path: names - allowed for path, names in found.items() if names - allowed} == {}
+    for floor in ("smsr", "worker"):
+        assert [path for path, names in everything(floor).items() if "smsr_client" in names] == []
+
+
+def test_the_web_side_takes_the_documents_of_the_client_only() -> None:
+    """Only the command line talks to a server."""
+    for path in modules("service"):
+        if path.is_relative_to(ROOT / "service" / "cli"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("smsr_client"):
+                assert node.module == "smsr_client.documents", f"{path}:{node.lineno}"
 
 
 def test_the_worker_knows_nothing_of_the_web() -> None:

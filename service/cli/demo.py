@@ -16,13 +16,13 @@ import typer
 from service.cli.bars import progress_bars, stage_text
 from service.cli.exits import console
 from service.cli.remote import fetch
-from service.client import Client, ClientError, require_success
 from smsr.synthetic import write_example
+from smsr_client import Client, ClientError, require_success
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from service.schemas import Job
+    from smsr_client.documents import Job
 
 _STOP_SECONDS = 60
 _NOT_INHERITED = (

@@ -9,9 +9,9 @@ from typing import NoReturn
 from rich.console import Console
 from rich.markup import escape
 
-from service.client import ClientError, ServerUnreachable, ServiceError
 from smsr.benchmark import BenchmarkFailed
 from smsr.errors import Cancelled, InputError, InvalidOption, SmsrError, UnknownOption
+from smsr_client import ClientError, ServerUnreachable, ServiceError
 
 
 class ExitCode(enum.IntEnum):

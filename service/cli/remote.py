@@ -23,9 +23,9 @@ from service.cli.local import (
     Preset,
     preset_and_options,
 )
-from service.client import FINAL, Client, ClientError, require_success
-from service.schemas import JobStatus
 from smsr.options import parse
+from smsr_client import FINAL, Client, ClientError, require_success
+from smsr_client.documents import JobStatus
 from worker.options import JobOptions
 from worker.records import Priority
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from rich.progress import Progress
 
-    from service.schemas import Job
+    from smsr_client.documents import Job
 
 Server = Annotated[
     str, typer.Option(envvar="SMSR_SERVER", metavar="URL", help="Address of the server.")

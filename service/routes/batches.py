@@ -11,15 +11,9 @@ from service.batches import stream_batch
 from service.context import Context, Shared, root_of
 from service.problems import Problem, example_responses
 from service.routes.jobs import PAGE_SIZE
-from service.schemas import (
-    BatchCancelled,
-    BatchDocument,
-    BatchList,
-    BatchRetried,
-    batch_document,
-    batch_entry,
-)
+from service.schemas import batch_document, batch_entry
 from service.submissions import LABEL_PATTERN
+from smsr_client.documents import BatchCancelled, BatchDocument, BatchList, BatchRetried
 from worker import batches
 from worker.batches import Batch
 

@@ -8,7 +8,7 @@ from redis.exceptions import RedisError
 
 from service.context import Context, Shared
 from service.problems import RETRY_SECONDS, Problem, example_responses
-from service.schemas import Health, Readiness
+from smsr_client.documents import Health, Readiness
 from worker.storage import StorageError
 
 router = APIRouter(tags=["health"])

@@ -5,9 +5,10 @@ from fastapi import APIRouter
 import smsr
 from service.context import Shared
 from service.routes.jobs import PAGE_SIZE
-from service.schemas import Formats, Info, Limits, option_document
+from service.schemas import option_document
 from service.waiting import MAX_WAIT_SECONDS
 from smsr.options import describe
+from smsr_client.documents import Formats, Info, Limits
 from worker.options import JobOptions
 
 router = APIRouter(prefix="/v1", tags=["service"])

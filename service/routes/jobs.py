@@ -15,11 +15,12 @@ from service.downloads import diagnostics_of
 from service.idempotency import REPLAYED, ClaimedKey, Digests, claimed
 from service.incoming import is_json, limits_of, read_references, take_references
 from service.problems import Problem, example_responses
-from service.schemas import Job, JobList, JobStatus, job_document
+from service.schemas import job_document
 from service.submissions import Label, accept, fingerprint_of, settings_schema
 from service.uploads import FILES, receive_submission
 from service.waiting import preferred_wait, wait_until_final
 from smsr.options import describe
+from smsr_client.documents import Job, JobList, JobStatus
 from worker.options import JobOptions
 from worker.queue import InputsGone
 from worker.records import JobActive, JobRecord, new_job_id

@@ -7,8 +7,8 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from service.context import root_of
 from service.problems import CATALOGUE, Problem, ProblemType, example_responses
-from service.schemas import ProblemTypeDocument
 from service.security import policy_of_document
+from smsr_client.documents import ProblemTypeDocument
 
 router = APIRouter(prefix="/problems", tags=["service"])
 

@@ -28,8 +28,9 @@ from service.incoming import (
     unknown_upload,
 )
 from service.problems import Problem, example_responses
-from service.schemas import UploadDocument, UploadList, upload_document
+from service.schemas import upload_document
 from service.uploads import FILES, safe_name
+from smsr_client.documents import UploadDocument, UploadList
 from worker.records import new_job_id
 from worker.uploads import Upload, new_folder
 

@@ -19,8 +19,8 @@ import httpx
 import numpy as np
 import pytest
 
-from service.client import Client
 from smsr.synthetic import make_example
+from smsr_client import Client
 from tests.docker.engine import REPOSITORY, Compose, docker, inspect, logs
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from service.schemas import Job
+    from smsr_client.documents import Job
 
     Array: TypeAlias = NDArray[Any]
 

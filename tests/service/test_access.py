@@ -21,7 +21,7 @@ from starlette.routing import Mount
 
 from service.access import PUBLIC, policy_for
 from service.app import create_app
-from service.client import Client
+from smsr_client import Client
 from tests.conftest import clean_environment, redis_running, serving
 from tests.service.conftest import Api, api_running, npy, problem, settings_for, submit
 from worker.keys import KeyStore

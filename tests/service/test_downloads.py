@@ -16,8 +16,8 @@ import httpx
 import numpy as np
 import pytest
 
-from service.client import Client
 from service.downloads import disposition, safe_media_type
+from smsr_client import Client
 from tests.conftest import redis_running
 from tests.service.conftest import (
     Api,

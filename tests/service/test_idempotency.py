@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import httpx
 import pytest
 
-from service.client import Client
 from service.idempotency import CLAIM_SECONDS, read_key
 from service.problems import Problem
+from smsr_client import Client
 from tests.service.conftest import Api, api_running, finished, problem, settings_for, wait_for
 from worker.records import IdempotencyKey, JobRecord, KeyTaken, RecordStore, new_job_id
 

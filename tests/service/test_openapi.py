@@ -9,7 +9,7 @@ from openapi_spec_validator import OpenAPIV31SpecValidator
 
 from service.app import create_app
 from service.problems import CATALOGUE, MEDIA_TYPE
-from service.schemas import Job
+from smsr_client.documents import Job
 from worker.settings import Settings
 
 if TYPE_CHECKING:

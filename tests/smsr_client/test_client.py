@@ -14,14 +14,14 @@ import httpx
 import numpy as np
 import pytest
 
-from service.client import Client, JobFailed, ServerUnreachable, ServiceError, require_success
 from smsr.synthetic import write_example
+from smsr_client import Client, JobFailed, ServerUnreachable, ServiceError, require_success
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from service.schemas import Job
+    from smsr_client.documents import Job
     from tests.conftest import Served
 
 
