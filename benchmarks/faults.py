@@ -37,8 +37,8 @@ import redis
 from threadpoolctl import threadpool_limits
 
 import smsr
-from service.client import Client, ServiceError
 from smsr.synthetic import make_low_rank
+from smsr_client import Client, ServiceError
 from worker.connections import connect
 from worker.pool import WorkerPool
 from worker.processes import KeptProcess
@@ -49,7 +49,7 @@ from worker.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from service.schemas import Job
+    from smsr_client import Job
 
 SIZES = ((60, 41), (120, 400), (60, 20_000))
 """Frames and points of small, medium and large jobs; the last are uploads of 10 MB and more."""

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from service.client import Client, require_success
 from service.routes.page import BUILT
 from smsr.synthetic import make_example
+from smsr_client import Client, require_success
 from tests.browser.conftest import FLAGS, find_chromium
 from tests.conftest import clean_environment, serving
 

@@ -59,7 +59,8 @@ def test_arrays_go_in_and_arrays_come_out(served: Served, example: Example) -> N
             faces=example.faces,
             progress=seen.append,
         )
-    assert (result.shapes.shape, result.shapes.dtype) == ((20, 36, 3), np.float32)
+    assert result.shapes.shape == (20, 36, 3)
+    assert result.shapes.dtype == np.float32
     assert result.faces is not None
     assert np.array_equal(result.faces, example.faces)
     assert result.metrics is not None
