@@ -98,7 +98,8 @@ class Gate:
         """
         path = get_route_path(request.scope)
         if path == "/metrics":
-            self._check_metrics(request)
+            if request.method in ("GET", "HEAD"):  # others are not allowed to anybody
+                self._check_metrics(request)
         elif f"{path}/".startswith("/v1/") and path not in PUBLIC:
             return await self._admit_to_api(request)
         return {}

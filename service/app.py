@@ -20,15 +20,18 @@ from service.context import Context
 from service.downloads import OpenResults
 from service.lingering import LingeringClose
 from service.metrics import MeasuredRequests, Metrics
+from service.requests import TrackedRequests
 from service.routes import batches, events, health, info, jobs, metrics, page, results, uploads
 from service.routes import problems as problem_pages
 from service.security import SecurityHeaders
 from service.webhooks import Deliverer
 from worker.changes import ChangeFeed
 from worker.connections import connect_async
+from worker.logs import configure_logging
 from worker.maintenance import Maintenance
 from worker.queue import JobQueue
 from worker.settings import Settings
+from worker.tracing import Tracing
 from worker.uploads import Digests, UploadStore
 
 if TYPE_CHECKING:
@@ -56,6 +59,8 @@ CORS_REQUEST_HEADERS = (
     "Upload-Metadata",
     "Upload-Offset",
     "X-API-Key",
+    "X-Request-ID",
+    "traceparent",
 )
 CORS_ANSWER_HEADERS = (
     "Accept-Ranges",
@@ -77,6 +82,7 @@ CORS_ANSWER_HEADERS = (
     "Upload-Length",
     "Upload-Metadata",
     "Upload-Offset",
+    "X-Request-ID",
 )
 """What pages of other origins may send and read, where they may at all."""
 
@@ -124,8 +130,9 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
             opened = OpenResults(queue.storage)
             uploaded = UploadStore(queue.redis, ttl=settings.upload_ttl_seconds)
             app.state.gate = Gate(settings, policy, redis)
+            app.state.tracing = tracing = Tracing("smsr-api")
             app.state.context = Context(
-                settings, queue, feed, opened, measured, uploaded, Digests()
+                settings, queue, feed, opened, measured, uploaded, Digests(), tracing
             )
             beside = [asyncio.create_task(_keep_order(queue), name="maintenance")]
             if settings.webhook_secret:
@@ -139,6 +146,7 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
                 await asyncio.gather(*beside, return_exceptions=True)
                 queue.redis.close()
                 measured.close()
+                await to_thread.run_sync(tracing.close)
 
     app = FastAPIOffline(
         docs_url=None,
@@ -182,6 +190,7 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
         results={route.path for route in results.router.routes if isinstance(route, APIRoute)}
         | {batches.RESULTS},
     )
+    app.add_middleware(TrackedRequests)
     app.add_middleware(LingeringClose)
     return app
 
@@ -203,7 +212,9 @@ def app_from_environment() -> FastAPI:
     For servers that take a factory, as in ``uvicorn --factory service.app:app_from_environment``.
     Such a server does not say where it listens, so API keys are needed unless ``SMSR_ACCESS=open``.
     """
-    return create_app(Settings())
+    settings = Settings()
+    configure_logging(settings.log_level)
+    return create_app(settings)
 
 
 async def _keep_order(queue: JobQueue) -> None:

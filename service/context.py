@@ -8,11 +8,13 @@ from fastapi import Depends, Path, Request
 from service.downloads import OpenResults
 from service.metrics import Metrics
 from service.problems import Problem
+from service.requests import request_id
 from worker.changes import ChangeFeed
 from worker.queue import JobQueue
 from worker.records import ANY, Allowance, JobRecord
 from worker.settings import Settings
 from worker.storage import ObjectStorage
+from worker.tracing import Tracing
 from worker.uploads import Digests, UploadStore
 
 
@@ -33,10 +35,13 @@ class Context:
         Uploads on their own; its calls block.
     digests : Digests
         Of the uploads that this process receives.
+    tracing : Tracing
     owner : str or None
         Whose jobs this request may see and make; None where all clients share all of them.
     allowance : Allowance
         What the owner may have.
+    request : str or None
+        Id of the request.
     """
 
     settings: Settings
@@ -46,8 +51,10 @@ class Context:
     metrics: Metrics
     uploads: UploadStore
     digests: Digests
+    tracing: Tracing
     owner: str | None = None
     allowance: Allowance = ANY
+    request: str | None = None
 
     @property
     def storage(self) -> ObjectStorage:
@@ -75,7 +82,12 @@ def unknown_job(job_id: str) -> Problem:
 
 def _context(request: Request) -> Context:
     context: Context = request.app.state.context
-    return replace(context, owner=request.state.owner, allowance=request.state.allowance)
+    return replace(
+        context,
+        owner=request.state.owner,
+        allowance=request.state.allowance,
+        request=request_id(request.scope),
+    )
 
 
 def _job_id(

@@ -19,6 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.routing import compile_path
 
+from service.requests import REQUEST_ID, request_id
 from service.security import protect
 from smsr import errors
 from worker import problems as worker_problems
@@ -479,7 +480,7 @@ _OF_THE_SERVICE = (
         InternalError.title,
         500,
         "An error that nobody foresaw. Its trace is in the service's log, never in an answer.",
-        "Try again; tell the operator the time and the address if it lasts.",
+        "Try again; tell the operator the X-Request-ID of the answer if it lasts.",
     ),
 )
 
@@ -621,7 +622,10 @@ def respond(
     body = document(kind, detail, request.url.path, context or {})
     answer = ProblemResponse(body, status_code=kind.status, headers=dict(headers or {}))
     # A 500 is answered outside of all middleware, so it gets these headers here.
-    protect(MutableHeaders(raw=answer.raw_headers), request.url.path)
+    headers_of_answer = MutableHeaders(raw=answer.raw_headers)
+    protect(headers_of_answer, request.url.path)
+    if known_as := request_id(request.scope):
+        headers_of_answer[REQUEST_ID] = known_as
     return answer
 
 

@@ -11,13 +11,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import logging
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import structlog
 from anyio import to_thread
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from worker.records import IdempotencyKey, InputFile
     from worker.storage import Sink
 
-_log = logging.getLogger(__name__)
+_log = structlog.get_logger(__name__)
 
 _NOT_IN_RESULTS = ("time_limit",)
 """Options that do not change what a job that succeeds gives."""
@@ -281,6 +281,21 @@ async def accept(
         except Problem:
             await discard_uploads(shared.storage, job_id)
             raise
+    with shared.tracing.span("submit job", kind="producer", smsr__job=job_id) as span:
+        record = await _submit(shared, job_id, submission, uploads, key, span.traceparent)
+    _log.info("job accepted", job=job_id, status=record.status, batch=record.batch)
+    return record
+
+
+async def _submit(
+    shared: Context,
+    job_id: str,
+    submission: Submission,
+    uploads: Sequence[str],
+    key: IdempotencyKey | None,
+    trace: str | None,
+) -> JobRecord:
+    settings = submission.settings
     record = JobRecord.new(
         job_id,
         options=dataclasses.asdict(submission.options),
@@ -294,6 +309,8 @@ async def accept(
         frames=submission.frames,
         points=submission.points,
         webhook=settings.webhook,
+        request=shared.request,
+        trace=trace,
     )
     held = (*uploads, *submission.from_uploads.values())
     reuse = shared.settings.reuse_results if settings.reuse is None else settings.reuse

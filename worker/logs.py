@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def configure_logging(level: str = "INFO") -> None:
     """Send all logs, those of libraries too, to standard error as JSON.
 
-    What is bound by `structlog.contextvars` (job and attempt) is part of each line.
+    What is bound by `structlog.contextvars` (request, job and attempt) is part of each line.
     """
     common: list[Processor] = [
         structlog.contextvars.merge_contextvars,
@@ -43,6 +43,10 @@ def configure_logging(level: str = "INFO") -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level)
+    # Uvicorn on its own has handlers of its own; access lines are `service.requests`'.
+    for library in ("uvicorn", "uvicorn.error", "uvicorn.access"):
+        logging.getLogger(library).handlers = []
+        logging.getLogger(library).propagate = library != "uvicorn.access"
     # RQ tells of every ticket at INFO; our own lines say it with the job id.
     for library in ("rq", "rq.worker", "rq.job"):
         logging.getLogger(library).setLevel(logging.WARNING)

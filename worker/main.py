@@ -24,6 +24,7 @@ import structlog
 from redis.exceptions import RedisError
 from threadpoolctl import threadpool_limits
 
+from worker import tracing
 from worker.connections import connect
 from worker.logs import configure_logging
 from worker.maintenance import Maintenance
@@ -123,6 +124,7 @@ def _prepare_for_forks(threads: int) -> None:
     threadpool_limits(threads)
     environment_settings.cache_clear()
     environment_settings()
+    tracing.preload()
     gc.collect()
     gc.freeze()
 

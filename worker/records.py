@@ -36,6 +36,10 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 FINAL: tuple[Status, ...] = ("succeeded", "failed", "cancelled")
 
 _DOCUMENTS = ("options", "inputs", "progress", "metrics", "timings", "problem", "webhook_state")
+_OPTIONAL = (
+    *("name", "batch", "priority", "ttl", "digest", "frames", "points", "webhook"),
+    *("request", "trace"),
+)
 _NO_STAGES = ("queued", "total")
 _PAGE_LIMIT = 1000
 _SCRIPT = counters.LUA + (
@@ -118,7 +122,8 @@ class JobRecord:
     id : str
         32 hexadecimal digits.
     status : {'queued', 'running', 'succeeded', 'failed', 'cancelled'}
-    created_at, started_at, finished_at, expires_at : float or None
+    created_at, queued_at, started_at, finished_at, expires_at : float or None
+        `queued_at` is when it was last queued, which a retry or a lost worker does again;
         `started_at` is that of the current attempt.
     options : dict
         Fields of `worker.options.JobOptions`.
@@ -159,6 +164,10 @@ class JobRecord:
         Address that is told when the job ends.
     webhook_state : dict or None
         How that stands: 'state', 'attempts' and what else `outbox.lua` notes.
+    request : str or None
+        Id of the request that submitted it, which is in the logs of the API and of the workers.
+    trace : str or None
+        Span of the submission, as a ``traceparent`` (W3C Trace Context).
     """
 
     id: str
@@ -190,6 +199,9 @@ class JobRecord:
     version: int = 0
     webhook: str | None = None
     webhook_state: Mapping[str, Any] | None = None
+    queued_at: float | None = None
+    request: str | None = None
+    trace: str | None = None
 
     @classmethod
     def new(
@@ -207,6 +219,8 @@ class JobRecord:
         frames: int | None = None,
         points: int | None = None,
         webhook: str | None = None,
+        request: str | None = None,
+        trace: str | None = None,
     ) -> JobRecord:
         """Return the record of a job to submit; Redis stamps its time of creation."""
         return cls(
@@ -224,6 +238,8 @@ class JobRecord:
             frames=frames,
             points=points,
             webhook=webhook,
+            request=request,
+            trace=trace,
         )
 
     @property
@@ -636,7 +652,7 @@ class RecordStore:
             "options": _encode(record.options),
             "inputs": _encode({r: dataclasses.asdict(f) for r, f in record.inputs.items()}),
         }
-        for name in ("name", "batch", "priority", "ttl", "digest", "frames", "points", "webhook"):
+        for name in _OPTIONAL:
             value = getattr(record, name)
             if value is not None:
                 fields[name] = value
@@ -938,6 +954,9 @@ def decode(job_id: str, found: Mapping[bytes, bytes]) -> JobRecord | None:
         version=int(texts["version"]),
         webhook=texts.get("webhook"),
         webhook_state=documents.get("webhook_state"),
+        queued_at=number("queued_at"),
+        request=texts.get("request"),
+        trace=texts.get("trace"),
     )
 
 

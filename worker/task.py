@@ -43,6 +43,7 @@ from worker.queue import JobQueue
 from worker.records import RecordStore, Verdict, result_prefix, upload_prefix
 from worker.settings import environment_settings
 from worker.storage import ObjectMissing, ObjectStorage, StorageError
+from worker.tracing import Tracing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 
     from worker.records import JobRecord
     from worker.settings import Settings
+    from worker.tracing import Span
 
 T = TypeVar("T")
 
@@ -95,16 +97,46 @@ def run(job_id: str) -> None:
     with structlog.contextvars.bound_contextvars(job=job_id, attempt=attempt):
         record = _insist(partial(records.get, job_id))
         if record is not None:
+            if record.request is not None:
+                structlog.contextvars.bind_contextvars(request=record.request)
+            _run(settings, records, record, attempt)
+
+
+def _run(settings: Settings, records: RecordStore, record: JobRecord, attempt: int) -> None:
+    """Run an attempt as a span of the trace that its submission began."""
+    tracing = Tracing("smsr-worker")
+    try:
+        with tracing.span(
+            "run job",
+            parent=record.trace,
+            kind="consumer",
+            smsr__job=record.id,
+            smsr__attempt=attempt,
+            smsr__request=record.request,
+        ) as span:
+            if span.trace_id is not None:
+                structlog.contextvars.bind_contextvars(trace=span.trace_id)
             log.info("attempt began", queued_seconds=_queued_seconds(record))
-            _Attempt(settings, records, record, attempt).run()
+            _Attempt(settings, records, record, attempt, tracing, span).run()
+    finally:
+        tracing.close()
 
 
 class _Attempt:
     """One attempt: does the work, and says how it ended."""
 
     def __init__(
-        self, settings: Settings, records: RecordStore, record: JobRecord, attempt: int
+        self,
+        settings: Settings,
+        records: RecordStore,
+        record: JobRecord,
+        attempt: int,
+        tracing: Tracing,
+        span: Span,
     ) -> None:
+        self.tracing = tracing
+        self.span = span
+        self.stage: tuple[str, Span] | None = None
         self.settings = settings
         self.records = records
         self.record = record
@@ -153,6 +185,7 @@ class _Attempt:
             log.exception("attempt failed unexpectedly", reference=reference)
             self._fail(InternalError(reference))
         finally:
+            self._end_stage()
             shutil.rmtree(self.folder, ignore_errors=True)
 
     # The work
@@ -264,9 +297,22 @@ class _Attempt:
     # Progress
 
     def _solver_progress(self, progress: Progress) -> bool:
+        self._trace(progress.stage)
         return self.report(dataclasses.replace(progress, fraction=SOLVER_SHARE * progress.fraction))
 
+    def _trace(self, stage: str) -> None:
+        """Have a span for the stage, which ends that of the one before."""
+        if self.tracing.on and (self.stage is None or self.stage[0] != stage):
+            self._end_stage()
+            self.stage = stage, self.tracing.begin(stage)
+
+    def _end_stage(self) -> None:
+        if self.stage is not None:
+            self.stage[1].end()
+            self.stage = None
+
     def _stage(self, name: str, fraction: float) -> None:
+        self._trace(name)
         if not self.report(Progress(name, fraction)):
             raise Cancelled(f"The run was cancelled in stage {name!r}.", stage=name)
 
@@ -307,6 +353,10 @@ class _Attempt:
     def _end(self, outcome: str, step: Callable[[], Verdict]) -> Verdict:
         """Take the last step of the attempt, however long Redis is away."""
         verdict = _insist(step)
+        self._end_stage()
+        self.span.set(smsr__outcome=outcome)
+        if outcome == "failed":
+            self.span.fail(outcome)
         log.info("attempt ended", outcome=outcome, verdict=str(verdict), timings=self.timings)
         return verdict
 
@@ -349,4 +399,5 @@ def _persist(action: Callable[[], T], errors: type[Exception], seconds: float) -
 
 
 def _queued_seconds(record: JobRecord) -> float:
-    return max(0.0, (record.started_at or record.created_at) - record.created_at)
+    queued_at = record.queued_at or record.created_at
+    return max(0.0, (record.started_at or queued_at) - queued_at)

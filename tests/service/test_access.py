@@ -444,6 +444,8 @@ def test_metrics_and_readiness_tell_nothing_of_jobs(guarded: Guarded, files: Fil
         for client in (ann, anyone):
             answer = client.get("/metrics")
             problem(answer, "unauthorized", 401)
+        for method in ("POST", "TRACE"):
+            problem(anyone.request(method, "/metrics"), "method-not-allowed", 405)
         token = {"Authorization": "Bearer a-token-for-metrics"}
         assert 'smsr_jobs{status="queued"} 1.0' in anyone.get("/metrics", headers=token).text
 

@@ -31,7 +31,7 @@ from worker.changes import ChangeFeed
 from worker.checksums import CHECKSUMS, FRAME_CHECKSUMS
 from worker.connections import connect, connect_async
 from worker.queue import JobQueue
-from worker.records import result_prefix
+from worker.records import record_key, result_prefix
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -307,9 +307,14 @@ def test_cancelling_a_running_job(
     assert list(queue.storage.list_prefix(f"results/{job_id}/")) == []
     check_nothing_is_running(queue, start_worker.settings)
     # The worker is fit for more, and the job can be run again.
+    assert queue.redis.hincrbyfloat(record_key(job_id), "created_at", -1000)
     queue.retry(job_id)
     again = wait_for_end(queue, job_id)
     assert (again.status, again.attempt, again.cancel_requested) == ("succeeded", 2, False)
+    assert again.queued_at is not None
+    assert again.started_at is not None
+    assert again.timings["queued"] == pytest.approx(again.started_at - again.queued_at, abs=1e-3)
+    assert again.timings["queued"] < 60
 
 
 def test_deleting_a_running_job(queue: JobQueue, submit: Submitter, start_worker: Workers) -> None:
