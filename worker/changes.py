@@ -218,13 +218,14 @@ class ChangeFeed:
             try:
                 async with self.redis.pubsub() as subscription:
                     await subscription.psubscribe(f"{PREFIX}:changed:*")
-                    self._wake_all()
                     while True:
-                        message = await subscription.get_message(
-                            ignore_subscribe_messages=True, timeout=_LOOK_ANYWAY_SECONDS
-                        )
-                        if message is not None:
-                            self._announce(message["channel"], message["data"])
+                        message = await subscription.get_message(timeout=_LOOK_ANYWAY_SECONDS)
+                        match message and message["type"]:
+                            case "psubscribe":
+                                # The client may have connected again by itself in between.
+                                self._wake_all()
+                            case "pmessage":
+                                self._announce(message["channel"], message["data"])
             except (RedisError, OSError) as error:
                 log.warning("changes of jobs cannot be heard", reason=str(error))
                 await asyncio.sleep(_RECONNECT_SECONDS)
