@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import signal
@@ -15,12 +16,15 @@ import pytest
 from smsr.progress import Progress
 from tests.conftest import redis_running
 from tests.service.conftest import api_running, finished, problem, settings_for, submit, wait_for
+from worker.changes import ChangeFeed, Deletion, Gap
+from worker.connections import connect_async
 from worker.records import JobRecord, RecordStore
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from tests.conftest import RedisProcess
     from tests.service.conftest import Api
 
 
@@ -245,3 +249,64 @@ def test_a_client_that_goes_away_is_forgotten(idle_api: Api, store: RecordStore)
     report(store, job_id, 0.5)
     wait_for(lambda: httpx.get(f"{idle_api.url}/healthz").status_code == 200)
     assert idle_api.log.read_text() == before
+
+
+def test_an_owner_hears_of_no_other(redis_process: RedisProcess, redis_url: str) -> None:
+    store = RecordStore(redis_process.client())
+
+    async def heard() -> list[str]:
+        found: list[str] = []
+        async with connect_async(redis_url) as redis, ChangeFeed(redis) as feed:
+            async for change in feed.watch_all("ann"):
+                if isinstance(change, Gap):
+                    if not found:
+                        found.append("gap")
+                        await asyncio.sleep(0.3)  # the subscription stands
+                        other = await asyncio.to_thread(queued, store, "bob")
+                        await asyncio.to_thread(store.delete, other)
+                        await asyncio.to_thread(queued, store, None)
+                        own = await asyncio.to_thread(queued, store, "ann")
+                        await asyncio.to_thread(store.delete, own)
+                    continue
+                found.append("own" if change.id == own else "another's")
+                if isinstance(change, Deletion):
+                    return found
+        return found
+
+    assert set(asyncio.run(heard())) == {"gap", "own"}
+
+
+def test_many_streams_cost_little(idle_api: Api, store: RecordStore) -> None:
+    """They share connections to Redis, and more may begin at once than there are of those."""
+    count = 200
+    job_id = begun(store)
+    redis = idle_api.redis.client()
+    head = f"GET /v1/jobs/{job_id}/events HTTP/1.1\r\nHost: here\r\n\r\n".encode()
+
+    async def follow(ready: asyncio.Semaphore) -> float:
+        port = int(idle_api.url.rpartition(":")[2])
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        try:
+            writer.write(head)
+            assert b" 200 " in await reader.readline()
+            await reader.readuntil(b'"running"')
+            ready.release()
+            await reader.readuntil(b'"succeeded"')
+            return time.monotonic()
+        finally:
+            writer.close()
+
+    async def run() -> float:
+        ready = asyncio.Semaphore(0)
+        following = [asyncio.create_task(follow(ready)) for _ in range(count)]
+        for _ in range(count):
+            await ready.acquire()
+        assert len(redis.client_list()) < count / 2
+        began = time.monotonic()
+        await asyncio.to_thread(publish, store, job_id)
+        return max(await asyncio.gather(*following)) - began
+
+    async def bounded() -> float:
+        return await asyncio.wait_for(run(), 30)
+
+    assert asyncio.run(bounded()) < 5
