@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from smsr.cameras import estimate_cameras, fix_gauge
 from smsr.cautions import (
@@ -37,6 +36,7 @@ from smsr.progress import Progress
 from smsr.result import Diagnostics, Reconstruction, StageReport
 from smsr.rowspace import factorise, map_back
 from smsr.shapes import basis_size_of, estimate_shapes
+from smsr.streaming import one_blas_thread
 from smsr.trajectories import smooth_trajectories
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def reconstruct(
     with clock.stage("factorising") as hook:
         space = factorise(source, progress=hook)
     # The matrices of the solver are small: threads of BLAS cost more than they bring.
-    with threadpool_limits(limits=1, user_api="blas"):
+    with one_blas_thread():
         solution = solve(space, resolve(options, points=space.points), clock)
     with clock.stage("writing") as hook:
         shapes = map_back(source, space, solution.lifting, out, progress=hook)
@@ -174,8 +174,8 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     unit = float(points.values[0])
     values = points.values / unit
     virtual = points.left * values
+    noise = points.noise / _spread(space)
     with clock.stage("cameras") as hook:
-        noise = points.noise / _spread(space)
         estimate = estimate_cameras(points.left, values, options, hook, noise=noise)
         rotations = fix_gauge(estimate.rotations)
         clock.note(estimate)
@@ -192,6 +192,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             camera_model=estimate.model,
             coherent=estimate.coherent,
             simpler=estimate.simpler,
+            noise=noise,
             hook=hook,
         )
         clock.note(found)

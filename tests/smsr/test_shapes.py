@@ -292,6 +292,13 @@ class TestTwoSolutions:
         width = np.linalg.norm(seen[:, :2].transpose(1, 0, 2).reshape(2, -1), 2)
         assert np.linalg.norm(seen[:, 2]) == pytest.approx(0.6 * width)
 
+    def test_of_very_noisy_tracks_deep_shapes_say_nothing(self) -> None:
+        _, rotations, found, deep = self.estimates(0.5)
+        assert with_deep_shapes(found, deep, rotations, 0.2) is found
+        little = with_deep_shapes(found, deep, rotations, 0.01).shapes
+        none = with_deep_shapes(found, deep, rotations).shapes
+        assert 0.9 < relative_error(little, found.shapes) / relative_error(none, found.shapes) < 1.0
+
     @pytest.mark.parametrize("mirrored", [False, True])
     def test_mean_depth_of_the_same_cameras_in_another_frame(self, mirrored: bool) -> None:
         W, rotations, _ = sequence(modes=2)
