@@ -319,7 +319,7 @@ def estimate_shapes(
     found = credible_depth(found, rotations)
     if found.complexity < DOUBTFUL or _trust(noise) == 0.0:
         return found
-    deep = reweighted_shapes(measurements, rotations, deep=True, **limits)
+    deep = reweighted_shapes(measurements, rotations, coherent=coherent, deep=True, **limits)
     return with_deep_shapes(found, deep, rotations, noise)
 
 
@@ -581,11 +581,11 @@ def rigid_shapes(
     )
 
 
-DOUBTFUL = 0.7
+DOUBTFUL = 0.6
 """Complexity above which the way into the problem decides on the depth."""
 
-_DEEP = (0.75, 0.85)  # complexities between which the deep shapes lose their part
-_PART_OF_DEEP = 0.6
+_DEEP = (0.7, 0.85)  # complexities between which the deep shapes lose their part
+_DEEPEST_BY_WIDTH = 1.25
 _NOISIEST = 0.15  # part of the tracks' spread
 
 
@@ -604,7 +604,7 @@ def with_deep_shapes(
 
     Where the camera turns little, the nuclear norm hardly changes between the two, and one has too
     little depth and the other often too much. Deep shapes count as far as they make the shapes
-    simpler, and with no more depth than the object is wide.
+    simpler, and with little more depth than the object is wide.
 
     Parameters
     ----------
@@ -616,14 +616,14 @@ def with_deep_shapes(
         As a part of the tracks' spread: the more there was, the less does simplicity say.
     """
     low, high = _DEEP
-    part = _PART_OF_DEEP * min(max((high - deep.complexity) / (high - low), 0.0), 1.0)
-    part *= _trust(noise)
+    part = min(max((high - deep.complexity) / (high - low), 0.0), 1.0) * _trust(noise)
     if part == 0.0:
         return estimate
     seen = rotations @ deep.shapes
     depth = math.sqrt(float((seen[:, 2] ** 2).mean()))
     image = seen[:, :2].transpose(1, 0, 2).reshape(2, -1)
     width = float(np.linalg.norm(image, 2)) / math.sqrt(seen[:, 2].size)
+    width *= _DEEPEST_BY_WIDTH
     depths = min(1.0, width / max(depth, np.finfo(float).tiny)) * seen[:, 2]
     axis = rotations[:, 2]
     present = np.matmul(axis[:, None], estimate.shapes)[:, 0]

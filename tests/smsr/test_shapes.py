@@ -274,23 +274,23 @@ class TestTwoSolutions:
             dataclasses.replace(found, shapes=less, complexity=complexity),
         )
 
-    @pytest.mark.parametrize("complexity", [0.5, 0.8, 0.9])
+    @pytest.mark.parametrize("complexity", [0.5, 0.775, 0.9])
     def test_deep_shapes_count_as_far_as_they_are_simple(self, complexity: float) -> None:
         W, rotations, found, deep = self.estimates(complexity)
         blend = with_deep_shapes(found, deep, rotations)
         np.testing.assert_allclose((rotations[:, :2] @ blend.shapes).reshape(W.shape), W, atol=1e-9)
         moved = np.linalg.norm(blend.shapes - found.shapes)
         part = moved / np.linalg.norm(deep.shapes - found.shapes)
-        assert part == pytest.approx({0.5: 0.6, 0.8: 0.3, 0.9: 0.0}[complexity], abs=1e-6)
+        assert part == pytest.approx({0.5: 1.0, 0.775: 0.5, 0.9: 0.0}[complexity], abs=1e-6)
 
-    def test_deep_shapes_are_no_deeper_than_the_object_is_wide(self) -> None:
+    def test_deep_shapes_are_little_deeper_than_the_object_is_wide(self) -> None:
         W, rotations, found, deep = self.estimates(0.5)
         planar = planar_shapes(W, rotations)
         far = dataclasses.replace(deep, shapes=planar + 1e3 * (deep.shapes - planar))
         flat = dataclasses.replace(found, shapes=planar)
         seen = rotations @ with_deep_shapes(flat, far, rotations).shapes
         width = np.linalg.norm(seen[:, :2].transpose(1, 0, 2).reshape(2, -1), 2)
-        assert np.linalg.norm(seen[:, 2]) == pytest.approx(0.6 * width)
+        assert np.linalg.norm(seen[:, 2]) == pytest.approx(1.25 * width)
 
     def test_of_very_noisy_tracks_deep_shapes_say_nothing(self) -> None:
         _, rotations, found, deep = self.estimates(0.5)
