@@ -1,5 +1,5 @@
 # Each target calls the script of its name in scripts/, which makes .venv and installs what is missing.
-.PHONY: help install page demo test test-browser test-containers lock lint format benchmark pictures clean
+.PHONY: help install page demo test test-browser test-containers lock lint format docs benchmark pictures clean
 
 help:
 	@echo "make demo       run the whole service on a generated example; results in demo-output/"
@@ -10,6 +10,7 @@ help:
 	@echo "make lint       style, format and types (make format mends what it can)"
 	@echo "make page       build the web page, which the service then serves (needs Node.js 20 or later)"
 	@echo "make benchmark  the accuracy table, on the data in SMSR_DATA or ../shared/data"
+	@echo "make docs       build the documentation into docs/build"
 	@echo "make pictures   draw the pictures of the documentation again"
 	@echo "make install    only the virtual environment in .venv"
 	@echo "make clean      remove .venv and everything generated"
@@ -44,9 +45,12 @@ format:
 benchmark:
 	@scripts/benchmark
 
+docs:
+	@scripts/docs
+
 pictures:
 	@scripts/install dev
 	@.venv/bin/python scripts/make_pictures.py
 
 clean:
-	rm -rf .venv service/page/dist service/page/node_modules demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv docs/build docs/generated service/page/dist service/page/node_modules demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
