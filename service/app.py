@@ -20,6 +20,7 @@ from service.context import Context
 from service.downloads import OpenResults
 from service.lingering import LingeringClose
 from service.metrics import MeasuredRequests, Metrics
+from service.readiness import Probe
 from service.requests import TrackedRequests
 from service.routes import batches, events, health, info, jobs, metrics, page, results, uploads
 from service.routes import problems as problem_pages
@@ -27,6 +28,7 @@ from service.security import SecurityHeaders
 from service.webhooks import Deliverer
 from worker.changes import ChangeFeed
 from worker.connections import connect_async
+from worker.disk import Disk
 from worker.logs import configure_logging
 from worker.maintenance import Maintenance
 from worker.queue import JobQueue
@@ -120,7 +122,8 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
     if settings.redis_url is None:
         raise ValueError("the service needs the address of a Redis server")
     redis_url = settings.redis_url
-    measured = Metrics(settings)
+    disk = Disk(settings)
+    measured = Metrics(settings, disk)
     policy = policy_for(settings, address)
 
     @asynccontextmanager
@@ -132,8 +135,9 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
             app.state.gate = Gate(settings, policy, redis)
             app.state.tracing = tracing = Tracing("smsr-api")
             app.state.context = Context(
-                settings, queue, feed, opened, measured, uploaded, Digests(), tracing
+                settings, queue, feed, opened, measured, uploaded, Digests(), tracing, disk
             )
+            app.state.probe = probe = Probe(settings, queue.storage, disk)
             beside = [asyncio.create_task(_keep_order(queue), name="maintenance")]
             if settings.webhook_secret:
                 deliverer = Deliverer(settings, queue.redis)
@@ -146,6 +150,7 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
                 await asyncio.gather(*beside, return_exceptions=True)
                 queue.redis.close()
                 measured.close()
+                probe.close()
                 await to_thread.run_sync(tracing.close)
 
     app = FastAPIOffline(

@@ -10,6 +10,7 @@ from service.metrics import Metrics
 from service.problems import Problem
 from service.requests import request_id
 from worker.changes import ChangeFeed
+from worker.disk import Disk
 from worker.queue import JobQueue
 from worker.records import ANY, Allowance, JobRecord
 from worker.settings import Settings
@@ -36,6 +37,7 @@ class Context:
     digests : Digests
         Of the uploads that this process receives.
     tracing : Tracing
+    disk : Disk
     owner : str or None
         Whose jobs this request may see and make; None where all clients share all of them.
     allowance : Allowance
@@ -52,6 +54,7 @@ class Context:
     uploads: UploadStore
     digests: Digests
     tracing: Tracing
+    disk: Disk
     owner: str | None = None
     allowance: Allowance = ANY
     request: str | None = None

@@ -21,7 +21,7 @@ from redis.exceptions import RedisError
 from service.problems import JOB_PROBLEMS
 from smsr import STAGES
 from worker.connections import connect
-from worker.counters import BOUNDS, SIZES, UNKNOWN_SIZE, Counters, Histogram
+from worker.counters import BOUNDS, REMOVED, SIZES, UNKNOWN_SIZE, Counters, Histogram
 from worker.outbox import OUTCOMES
 from worker.records import FINAL, RecordStore
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+    from worker.disk import Disk
     from worker.records import Survey
     from worker.settings import Settings
 
@@ -59,14 +60,16 @@ class Metrics:
     ----------
     settings : Settings
         With a `redis_url`.
+    disk : Disk
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, disk: Disk) -> None:
         self._jobs = JobMetrics(settings)
         self.requests = RequestMetrics()
         self._registry = CollectorRegistry()
         self._registry.register(self._jobs)
         self._registry.register(self.requests)
+        self._registry.register(DiskMetrics(disk))
 
     def expose(self, accept: str) -> tuple[bytes, str]:
         """Return all metrics as text, and its media type.
@@ -151,6 +154,12 @@ def _ends(counters: Counters) -> Iterator[Metric]:
     for slug in sorted(JOB_PROBLEMS | counters.failures.keys()):
         failures.add_metric([slug], counters.failures.get(slug, 0))
     yield failures
+    removed = CounterMetricFamily(
+        "smsr_removed", "What the maintenance has removed.", labels=["kind"]
+    )
+    for kind in REMOVED:
+        removed.add_metric([kind], counters.removed.get(kind, 0))
+    yield removed
     lost = "Attempts that ended with their worker."
     yield CounterMetricFamily("smsr_attempts_lost", lost, counters.lost)
     webhooks = CounterMetricFamily(
@@ -183,6 +192,27 @@ def _add(family: HistogramMetricFamily, labels: Sequence[str], histogram: Histog
     """Add a histogram to a family; the buckets of Prometheus contain those below them."""
     counts = itertools.accumulate(histogram.buckets)
     family.add_metric(labels, list(zip(_LIMITS, counts, strict=True)), histogram.sum)
+
+
+class DiskMetrics(Collector):
+    """How much room there is, as this process sees it.
+
+    Parameters
+    ----------
+    disk : Disk
+    """
+
+    def __init__(self, disk: Disk) -> None:
+        self._disk = disk
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield what is known; nothing of a bucket."""
+        free = self._disk.free()
+        if free is not None:
+            about = "Free bytes of the disk with the least, of storage and scratch."
+            yield GaugeMetricFamily("smsr_disk_free_bytes", about, free)
+            about = "Below so many free bytes uploads are refused."
+            yield GaugeMetricFamily("smsr_disk_reserve_bytes", about, self._disk.reserve)
 
 
 class RequestMetrics(Collector):

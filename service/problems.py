@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 MEDIA_TYPE = "application/problem+json"
 SCHEMA = {"$ref": "#/components/schemas/ProblemDocument"}
 """Of a problem document, in the OpenAPI document."""
+FULL_RETRY_SECONDS = 60
+"""When a full disk may have room again: jobs expire, and operators come."""
+
 RETRY_SECONDS = 5
 """What ``Retry-After`` says when Redis or the storage is away."""
 JOBS_RETRY_SECONDS = 5
@@ -406,7 +409,8 @@ _OF_THE_SERVICE = (
         "storage-full",
         "There is no room for the files",
         507,
-        "The disk of the service is full. What was accepted is not lost; an upload by tus goes on "
+        "The disk of the service is full, or nearly so: it takes no uploads, that running jobs can "
+        "finish. What was accepted is not lost; an upload by tus goes on "
         "from its offset when there is room again.",
         "Try again later; tell the operator if it lasts.",
     ),
@@ -739,7 +743,7 @@ async def _on_storage_full(request: Request, error: Exception) -> ProblemRespons
         request,
         CATALOGUE["storage-full"],
         "There is no room for more files at the moment.",
-        headers={"Retry-After": str(60)},
+        headers={"Retry-After": str(FULL_RETRY_SECONDS)},
     )
 
 

@@ -390,7 +390,10 @@ class Readiness(BaseModel):
     """That the service can take jobs."""
 
     status: Literal["ready"] = "ready"
-    checks: dict[str, str] = Field(examples=[{"redis": "ok", "storage": "ok"}])
+    checks: dict[str, str] = Field(
+        description="'ok' or what is wrong, of redis, storage, disk, workers and maintenance.",
+        examples=[{"redis": "ok", "storage": "ok", "disk": "nearly full: uploads are refused"}],
+    )
     workers: int = Field(description="Live worker processes; with none, jobs wait.")
     queued: int | None = Field(
         description="Jobs that wait for a worker; not told where API keys are needed."

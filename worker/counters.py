@@ -25,6 +25,9 @@ SIZES = {"small": 1e5, "medium": 1e7, "large": float("inf")}
 UNKNOWN_SIZE = "unknown"
 """Class of a job that failed before its size was known."""
 
+REMOVED = ("expired_job", "abandoned_upload", "orphan", "garbage")
+"""What the maintenance removes: jobs, uploads, and prefixes of objects without a job."""
+
 _LUA_BOUNDS = ", ".join(f"'{bound:g}'" for bound in BOUNDS)
 _LUA_SIZES = ", ".join(
     f"{{'{name}', {'math.huge' if values == float('inf') else values}}}"
@@ -83,6 +86,8 @@ class Counters:
         From the last start to the end, by size class (`SIZES` and `UNKNOWN_SIZE`).
     stages : dict of str to Histogram
         Stages of the jobs that succeeded.
+    removed : dict of str to int
+        What the maintenance has removed, by kind (`REMOVED`).
     webhooks : dict of str to int
         Attempts to deliver webhooks by how they ended: delivered, failed, given_up.
     """
@@ -95,6 +100,7 @@ class Counters:
     runs: dict[str, Histogram] = field(default_factory=dict)
     stages: dict[str, Histogram] = field(default_factory=dict)
     webhooks: dict[str, int] = field(default_factory=dict)
+    removed: dict[str, int] = field(default_factory=dict)
 
 
 def decode(found: Mapping[bytes, bytes]) -> Counters:
@@ -112,6 +118,8 @@ def decode(found: Mapping[bytes, bytes]) -> Counters:
                 counters.reused = int(value)
             case ["webhook", outcome]:
                 counters.webhooks[outcome] = int(value)
+            case ["removed", kind]:
+                counters.removed[kind] = int(value)
             case ["wait", part]:
                 counters.waits._add(part, value)
             case ["run", size, part]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import structlog
 from redis.exceptions import RedisError
@@ -17,13 +17,24 @@ from worker.storage import StorageError
 from worker.uploads import UploadStore, folder_prefix
 
 if TYPE_CHECKING:
+    from redis import Redis
+
     from worker.queue import JobQueue
 
 ORPHAN_LOOK_SECONDS = 3600.0
 
 _OBJECT = re.compile(r"(?P<kind>uploads|results|incoming)/(?P<job>[^/]+)/(?:(?P<attempt>\d+)/)?")
 
+_LAST = f"{PREFIX}:maintained"
+"""When any process had last done all that was due, in Unix seconds."""
+
 log = structlog.get_logger(__name__)
+
+
+def last_maintenance(redis: Redis) -> float | None:
+    """Return when order was last kept, in Unix seconds; None for never."""
+    found = cast("bytes | None", redis.get(_LAST))
+    return None if found is None else float(found)
 
 
 class Maintenance:
@@ -47,17 +58,27 @@ class Maintenance:
             self.expire_uploads,
             self.collect_garbage,
             self.collect_orphans,
+            self._note,
         ):
             try:
                 part()
             except (RedisError, StorageError) as error:
                 log.warning("maintenance is put off", part=part.__name__, reason=str(error))
 
+    def _note(self) -> None:
+        self.queue.redis.set(_LAST, time.time())
+
+    def _removed(self, kind: str, count: int) -> None:
+        """Count what was removed."""
+        if count:
+            self.queue.records.count_removed(kind, count)
+
     def expire(self) -> None:
         """Delete the jobs whose time to live has passed."""
         for job_id in self.queue.records.expired():
             if self.queue.delete(job_id, only_expired=True):
                 log.info("job expired", job=job_id)
+                self._removed("expired_job", 1)
 
     def expire_uploads(self) -> None:
         """Remove the objects of uploads that nobody went on with and no job took."""
@@ -71,12 +92,20 @@ class Maintenance:
             size += sum(item.bytes for item in found)
         if count:
             log.info("abandoned uploads removed", count=count, bytes=size)
+        self._removed("abandoned_upload", count)
 
     def collect_garbage(self) -> None:
         """Remove the objects of deleted jobs and of attempts that came to nothing."""
+        storage, count, size = self.queue.storage, 0, 0
         for prefix in self.queue.records.garbage():
-            self.queue.storage.delete_prefix(prefix)
+            found = list(storage.list_prefix(prefix))
+            storage.delete_prefix(prefix)
             self.queue.records.forget_garbage(prefix)
+            count += bool(found)
+            size += sum(item.bytes for item in found)
+        if count:
+            log.info("garbage removed", count=count, bytes=size)
+        self._removed("garbage", count)
 
     def collect_orphans(self) -> None:
         """Once an hour, remove old objects that no record knows.
@@ -87,9 +116,12 @@ class Maintenance:
         settings = self.queue.settings
         period = min(ORPHAN_LOOK_SECONDS, settings.orphan_grace_seconds)
         if self.queue.redis.set(f"{PREFIX}:orphans", 1, nx=True, px=int(period * 1000)):
+            count = 0
             for prefix in self._orphans(time.time() - settings.orphan_grace_seconds):
                 log.info("objects of no job removed", prefix=prefix)
                 self.queue.storage.delete_prefix(prefix)
+                count += 1
+            self._removed("orphan", count)
 
     def _orphans(self, before: float) -> list[str]:
         """Return prefixes without a record, none of whose objects changed after a time."""

@@ -512,6 +512,10 @@ class RecordStore:
         due = self.redis.zrangebyscore(f"{PREFIX}:garbage", "-inf", self._now(), start=0, num=limit)
         return [prefix.decode() for prefix in cast("list[bytes]", due)]
 
+    def count_removed(self, kind: str, count: int) -> None:
+        """Count what the maintenance has removed, by kind (`worker.counters.REMOVED`)."""
+        self.redis.hincrby(f"{PREFIX}:counters", f"removed:{kind}", count)
+
     def held(self, prefix: str) -> bool:
         """Whether jobs hold the result under this storage prefix that another job made."""
         return bool(self.redis.exists(f"{PREFIX}:holders:{prefix}"))

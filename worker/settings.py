@@ -62,6 +62,12 @@ class Settings(BaseSettings):
         "redirects to signed addresses of the store that are good for so long.",
     )
 
+    min_free_bytes: int = Field(
+        default=GIBIBYTE,
+        ge=0,
+        description="Room that uploads leave on the disks of a file:// storage and of the scratch "
+        "folder, so that running jobs can finish; 0 lets them fill the disk.",
+    )
     max_upload_bytes: int = Field(default=4 * GIBIBYTE, gt=0, description="Largest upload.")
     max_array_bytes: int = Field(
         default=16 * GIBIBYTE, gt=0, description="Largest array, decompressed."

@@ -615,6 +615,7 @@ def _failures(key: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise ObjectMissing(f"there is no object {key}") from error
     except (BaseError, OSError) as error:
-        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        if full or os.strerror(errno.ENOSPC) in str(error):  # obstore has the text only
             raise StorageFull(f"{key}: {error}") from error
         raise StorageError(f"{key}: {error}") from error

@@ -1,15 +1,10 @@
 """For the one that keeps the service running: is it alive, is it ready."""
 
-from collections.abc import Callable
-
-from anyio import to_thread
 from fastapi import APIRouter, Request
-from redis.exceptions import RedisError
 
-from service.context import Context, Shared
 from service.problems import RETRY_SECONDS, Problem, example_responses
+from service.readiness import ESSENTIAL, Probe
 from smsr_client.documents import Health, Readiness
-from worker.storage import StorageError
 
 router = APIRouter(tags=["health"])
 
@@ -25,35 +20,26 @@ async def alive() -> Health:
     summary="Whether jobs can be taken",
     responses=example_responses("not-ready"),
 )
-async def ready(request: Request, shared: Shared) -> Readiness:
-    """Check that Redis answers and that the storage can be written, and count the workers."""
-    found = await to_thread.run_sync(_look, shared)
-    # Who may not see a job may not see that there is one either.
-    secret = request.app.state.gate.policy == "keys"
-    return found.model_copy(update={"queued": None}) if secret else found
+async def ready(request: Request) -> Readiness:
+    """Check Redis and the storage, and tell of the disk, the workers and the maintenance.
 
-
-def _look(shared: Context) -> Readiness:
-    queue = shared.queue
-    checks = {
-        "redis": _outcome(queue.redis.ping, "does not answer"),
-        "storage": _outcome(lambda: shared.storage.check(), "cannot be written and read"),
-    }
-    if set(checks.values()) != {"ok"}:
-        wrong = "; ".join(f"{name} {found}" for name, found in checks.items() if found != "ok")
+    Without Redis or the storage the answer is 503. Where the disk is nearly full, no worker lives
+    or the maintenance is late, `checks` says so and the service is ready: what can be served is.
+    """
+    probe: Probe = request.app.state.probe
+    checks, survey = await probe.look()
+    wrong = "; ".join(f"{name} {checks[name]}" for name in ESSENTIAL if checks[name] != "ok")
+    if wrong or survey is None:
         raise Problem(
             "not-ready",
             f"The service cannot take jobs: {wrong}.",
             headers={"Retry-After": str(RETRY_SECONDS)},
             checks=checks,
         )
-    return Readiness(checks=checks, workers=queue.workers(), queued=queue.length())
-
-
-def _outcome(check: Callable[[], object], failure: str) -> str:
-    try:
-        check()
-    except (RedisError, StorageError):
-        # What exactly failed may name hosts and folders, which are nobody else's business.
-        return failure
-    return "ok"
+    # Who may not see a job may not see that there is one either.
+    secret = request.app.state.gate.policy == "keys"
+    return Readiness(
+        checks=dict(checks),
+        workers=survey.workers,
+        queued=None if secret else survey.jobs["queued"],
+    )

@@ -19,6 +19,7 @@ from service.schemas import job_document
 from service.submissions import Label, accept, fingerprint_of, settings_schema
 from service.uploads import FILES, receive_submission
 from service.waiting import preferred_wait, wait_until_final
+from service.watermark import watched
 from smsr.options import describe
 from smsr_client.documents import Job, JobList, JobStatus
 from worker.options import JobOptions
@@ -205,6 +206,7 @@ async def submit(
         repeated = key is not None and key.bound
         if not repeated:
             await quotas.check_jobs(shared)
+            request = await watched(shared, request)
         try:
             async with (
                 nullcontext(request) if repeated else quotas.room(shared, request, job_id)

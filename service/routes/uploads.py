@@ -30,6 +30,7 @@ from service.incoming import (
 from service.problems import Problem, example_responses
 from service.schemas import upload_document
 from service.uploads import FILES, safe_name
+from service.watermark import check_room, watched
 from smsr_client.documents import UploadDocument, UploadList
 from worker.records import new_job_id
 from worker.uploads import Upload, new_folder
@@ -176,6 +177,7 @@ async def create_upload(request: Request, shared: Shared) -> Response:
     with_piece = "content-type" in request.headers and _has_body(request)
     if with_piece:
         _check_type(request)
+    await check_room(shared, length)
     await hold(shared, upload)
     await to_thread.run_sync(shared.uploads.create, upload)
     if with_piece:
@@ -363,6 +365,7 @@ async def put_upload(
         length=0,
     )
     try:
+        request = await watched(shared, request)
         async with quotas.room(shared, request, upload.folder) as body:
             created = await receive_whole(body, shared, upload)
     except ClientDisconnect:
@@ -391,6 +394,7 @@ async def delete_upload(request: Request, shared: Shared, upload_id: UploadId) -
 
 async def _receive(request: Request, shared: Context, upload: Upload, offset: int) -> Upload:
     try:
+        request = await watched(shared, request, upload.length - offset)
         return await receive_piece(request, shared, upload, offset)
     except ClientDisconnect:
         raise _gone() from None

@@ -30,8 +30,11 @@ def test_alive_and_ready(client: httpx.Client, idle_api: Api) -> None:
     assert client.get("/healthz").json() == {"status": "alive"}
     ready = client.get("/readyz").json()
     assert ready["status"] == "ready"
-    assert ready["checks"] == {"redis": "ok", "storage": "ok"}
+    parts = ("redis", "storage", "disk", "workers", "maintenance")
+    assert ready["checks"] == dict.fromkeys(parts, "ok")
     assert ready["workers"] == 1
     with idle_api.client() as idle:
-        assert idle.get("/readyz").json()["workers"] == 0
+        ready = idle.get("/readyz").json()
+        assert (ready["status"], ready["workers"]) == ("ready", 0)
+        assert ready["checks"]["workers"] == "none lives: jobs wait"
     assert client.get("/healthz").headers["x-content-type-options"] == "nosniff"

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from smsr.synthetic import Example
 
 OF_ONE_PROCESS = ("smsr_http_requests", "smsr_http_request_seconds", "smsr_upload_bytes",
-                  "smsr_download_bytes")  # fmt: skip
+                  "smsr_download_bytes", "smsr_disk_free_bytes",
+                  "smsr_disk_reserve_bytes")  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
+import os
 import time
 from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from worker.maintenance import Maintenance
+from worker.maintenance import Maintenance, last_maintenance
 from worker.queue import JobQueue
-from worker.records import JobActive, JobExists, result_prefix, upload_prefix
+from worker.records import PREFIX, JobActive, JobExists, result_prefix, upload_prefix
 
 if TYPE_CHECKING:
     from tests.worker.conftest import Submitter
@@ -183,3 +184,24 @@ def test_maintenance_outlives_a_failing_storage(queue: JobQueue, submit: Submitt
 def test_the_queue_needs_a_server(settings: Settings) -> None:
     with pytest.raises(ValueError, match="Redis"):
         JobQueue(settings.model_copy(update={"redis_url": None}))
+
+
+def test_what_is_removed_is_counted(queue: JobQueue, submit: Submitter) -> None:
+    expired, deleted = submit(), submit()
+    queue.cancel(expired)
+    queue.redis.zadd(f"{PREFIX}:expiry", {expired: 1.0})
+    queue.storage.put_bytes(f"results/{deleted}/1/shapes.npy", b"late")
+    queue.redis.zadd(f"{PREFIX}:garbage", {f"results/{deleted}/1/": 1.0})
+    orphan = queue.storage.folder
+    assert orphan is not None
+    queue.storage.put_bytes("uploads/nobody/measurements", b"x")
+    os.utime(orphan / "uploads" / "nobody" / "measurements", (1.0, 1.0))
+    Maintenance(queue).run_once()
+    Maintenance(queue).run_once()
+    assert queue.records.survey(60).counters.removed == {
+        "expired_job": 1,
+        "garbage": 1,
+        "orphan": 1,
+    }
+    assert abs((last_maintenance(queue.redis) or 0.0) - time.time()) < 5
+    assert queue.records.get(deleted) is not None
