@@ -14,16 +14,20 @@ if TYPE_CHECKING:
 
     from worker.settings import Settings
 
-DRAIN_SECONDS = 5
-"""How long open requests, long polls above all, may still take when the server stops."""
-
 
 class _Server(uvicorn.Server):
-    """Uvicorn that tells when it is ready."""
+    """Uvicorn that tells when it is ready, and when it begins to stop."""
 
-    def __init__(self, config: uvicorn.Config, ready: Callable[[], object]) -> None:
+    def __init__(
+        self, config: uvicorn.Config, ready: Callable[[], object], stopping: Callable[[], object]
+    ) -> None:
         super().__init__(config)
         self._ready = ready
+        self._stopping = stopping
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._stopping()
+        await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
@@ -48,13 +52,14 @@ def run_server(settings: Settings, listener: socket.socket, ready: Callable[[], 
     bool
         False where the service could not start; the log says why.
     """
+    app = create_app(settings, address=listener.getsockname()[0])
     config = uvicorn.Config(
-        create_app(settings, address=listener.getsockname()[0]),
+        app,
         log_config=None,
         access_log=False,
         server_header=False,
-        timeout_graceful_shutdown=DRAIN_SECONDS,
+        timeout_graceful_shutdown=settings.drain_seconds,
     )
-    server = _Server(config, ready)
+    server = _Server(config, ready, lambda: app.state.context.feed.release())
     server.run(sockets=[listener])
     return server.started

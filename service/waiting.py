@@ -40,7 +40,7 @@ async def wait_until_final(feed: ChangeFeed, record: JobRecord, seconds: float) 
     current: JobRecord | None = record
     while current is not None and not current.final:
         left = deadline - time.monotonic()
-        if left <= 0:
+        if left <= 0 or feed.released:
             break
         current = await feed.wait(current.id, current.version, left)
     return current

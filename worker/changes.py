@@ -71,6 +71,15 @@ class ChangeFeed:
         self._reading = asyncio.Semaphore(_READS_AT_ONCE)
         self._fetches: dict[str, asyncio.Task[JobRecord | None]] = {}
         self._listener: asyncio.Task[None] | None = None
+        self.released = False
+        """Whether nobody is to wait any more."""
+
+    def release(self) -> None:
+        """Have `wait` return at once, now and from now on: the process is about to end."""
+        self.released = True
+        for waiting in self._waiting.values():
+            for announced in waiting:
+                announced.set()
 
     async def __aenter__(self) -> Self:
         self._listener = asyncio.create_task(self._listen(), name="job changes")
@@ -110,7 +119,8 @@ class ChangeFeed:
                 announced.clear()
                 record = await self.get(job_id)
                 remaining = deadline - time.monotonic()
-                if record is None or record.version != version or remaining <= 0:
+                due = remaining <= 0 or self.released
+                if record is None or record.version != version or due:
                     return record
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(announced.wait(), min(remaining, _LOOK_ANYWAY_SECONDS))

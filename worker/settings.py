@@ -174,6 +174,12 @@ class Settings(BaseSettings):
         description="Origins whose pages may use the API, with commas, as https://a.example.org.",
     )
 
+    drain_seconds: int = Field(
+        default=20,
+        ge=0,
+        description="Time that a stopping API leaves uploads and downloads under way; whoever only "
+        "waits for a job is answered at once.",
+    )
     event_heartbeat_seconds: float = Field(
         default=15,
         gt=0,
