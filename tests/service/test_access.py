@@ -142,7 +142,7 @@ FREE = {
     "slug": "internal",
     "array": "shapes",
     "role": "measurements",
-    "name": "x",
+    "name": "cameras",
     "form": "png",
 }
 """Parameters of paths that name nothing of an owner."""
