@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from worker.records import JobRecord
 
+_CANCEL_AGAIN_SECONDS = 1.0
 _RECONNECT_SECONDS = 1.0
 _LOOK_ANYWAY_SECONDS = 10.0
 """A waiter looks this often even when nothing was announced."""
@@ -91,10 +92,10 @@ class ChangeFeed:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._listener is not None:
+        # More than once if need be: the client of Redis may take a cancellation for a time-out.
+        while self._listener is not None and not self._listener.done():
             self._listener.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._listener
+            await asyncio.wait([self._listener], timeout=_CANCEL_AGAIN_SECONDS)
 
     async def get(self, job_id: str) -> JobRecord | None:
         """Return a record, or None when there is no such job."""

@@ -56,7 +56,7 @@ def test_problem_pages_are_for_people_and_for_programs(client: httpx.Client) -> 
 
 
 def test_addresses_and_methods_that_do_not_exist(client: httpx.Client) -> None:
-    for path in ("/", "/v1", "/v1/jobs/", "/v2/jobs", "/v1/jobs/1/2/3"):
+    for path in ("/v1", "/v1/jobs/", "/v2/jobs", "/v1/jobs/1/2/3"):
         problem(client.get(path), "not-found", 404)
     answer = client.put("/v1/jobs")
     problem(answer, "method-not-allowed", 405)
