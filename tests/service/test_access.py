@@ -246,7 +246,7 @@ def state_of(api: Api) -> dict[bytes, object]:
     redis = api.redis.client()
     kept: dict[bytes, object] = {name.encode(): None for name in api.stored()}
     for key in redis.scan_iter():
-        if not key.startswith((b"smsr:rate", b"smsr:looking", b"smsr:orphans")):
+        if not key.startswith((b"smsr:rate", b"smsr:looking", b"smsr:orphans", b"smsr:maintained")):
             # The dump of a hash has its fields in any order.
             kept[key] = redis.hgetall(key) if redis.type(key) == b"hash" else redis.dump(key)
     return kept
