@@ -1,16 +1,15 @@
 """Batches: looking at, cancelling, running again, removing and downloading jobs of one label."""
 
 from typing import Annotated
-from urllib.parse import urlencode
 
 from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.responses import StreamingResponse
 
+from service import paging
 from service.batches import stream_batch
 from service.context import Context, Shared, root_of
 from service.problems import Problem, example_responses
-from service.routes.jobs import PAGE_SIZE
 from service.schemas import batch_document, batch_entry
 from service.submissions import LABEL_PATTERN
 from smsr_client.documents import BatchCancelled, BatchDocument, BatchList, BatchRetried
@@ -43,26 +42,14 @@ def _unknown(label: str) -> Problem:
 @router.get(
     "",
     summary="List batches, latest first",
-    responses={
-        200: {
-            "headers": {
-                "Link": {
-                    "schema": {"type": "string"},
-                    "description": 'The next page, rel="next" (RFC 8288), where there is one.',
-                }
-            }
-        },
-        **example_responses("invalid-request", "queue-unavailable"),
-    },
+    responses=paging.RESPONSES,
 )
 async def list_batches(
     request: Request,
     response: Response,
     shared: Shared,
-    limit: Annotated[int, Query(ge=1, le=PAGE_SIZE, description="Batches on a page.")] = 50,
-    cursor: Annotated[
-        str | None, Query(max_length=100, description="From `next` of the page before.")
-    ] = None,
+    limit: Annotated[int, Query(ge=1, le=paging.PAGE_SIZE, description="Batches on a page.")] = 50,
+    cursor: paging.Cursor = None,
 ) -> BatchList:
     """Return one page of batches; those to which a job was added last come first."""
     try:
@@ -70,14 +57,9 @@ async def list_batches(
             batches.labels, shared.queue.records, shared.owner, cursor, limit
         )
     except ValueError:
-        raise Problem(
-            "invalid-request", f"query cursor: {cursor!r} was not given by a page before."
-        ) from None
+        raise paging.foreign_cursor(cursor) from None
     root = root_of(request)
-    following = None
-    if next_cursor is not None:
-        following = f"{root}/v1/batches?{urlencode({'limit': limit, 'cursor': next_cursor})}"
-        response.headers["Link"] = f'<{following}>; rel="next"'
+    following = paging.link_next(response, f"{root}/v1/batches", next_cursor, limit=limit)
     return BatchList(batches=[batch_entry(counts, root=root) for counts in found], next=following)
 
 

@@ -4,7 +4,7 @@ from fastapi import APIRouter
 
 import smsr
 from service.context import Shared
-from service.routes.jobs import PAGE_SIZE
+from service.paging import PAGE_SIZE
 from service.schemas import option_document
 from service.waiting import MAX_WAIT_SECONDS
 from smsr.options import describe

@@ -3,13 +3,12 @@
 from contextlib import nullcontext
 from functools import partial
 from typing import Annotated, Any
-from urllib.parse import urlencode
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
-from service import quotas
+from service import paging, quotas
 from service.context import Context, JobId, Shared, root_of, unknown_job
 from service.downloads import diagnostics_of
 from service.idempotency import REPLAYED, ClaimedKey, Digests, claimed
@@ -26,8 +25,6 @@ from worker.options import JobOptions
 from worker.queue import InputsGone
 from worker.records import JobActive, JobRecord, new_job_id
 from worker.storage import ObjectMissing
-
-PAGE_SIZE = 200
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -250,17 +247,7 @@ async def _receive(
 @router.get(
     "",
     summary="List jobs, newest first",
-    responses={
-        200: {
-            "headers": {
-                "Link": {
-                    "schema": {"type": "string"},
-                    "description": 'The next page, rel="next" (RFC 8288), where there is one.',
-                }
-            }
-        },
-        **example_responses("invalid-request", "queue-unavailable"),
-    },
+    responses=paging.RESPONSES,
 )
 async def list_jobs(
     request: Request,
@@ -268,10 +255,8 @@ async def list_jobs(
     shared: Shared,
     status: Annotated[JobStatus | None, Query(description="Only jobs of this status.")] = None,
     batch: Annotated[Label | None, Query(description="Only jobs of this batch.")] = None,
-    limit: Annotated[int, Query(ge=1, le=PAGE_SIZE, description="Jobs on a page.")] = 50,
-    cursor: Annotated[
-        str | None, Query(max_length=100, description="From `next` of the page before.")
-    ] = None,
+    limit: Annotated[int, Query(ge=1, le=paging.PAGE_SIZE, description="Jobs on a page.")] = 50,
+    cursor: paging.Cursor = None,
 ) -> JobList:
     """Return one page of jobs. Jobs that come or go in between do not shift the pages."""
     try:
@@ -281,16 +266,11 @@ async def list_jobs(
             )
         )
     except ValueError:
-        raise Problem(
-            "invalid-request", f"query cursor: {cursor!r} was not given by a page before."
-        ) from None
+        raise paging.foreign_cursor(cursor) from None
     root = root_of(request)
-    following = None
-    if page.next_cursor is not None:
-        query = {"status": status, "batch": batch, "limit": limit, "cursor": page.next_cursor}
-        given = {name: value for name, value in query.items() if value is not None}
-        following = f"{root}/v1/jobs?{urlencode(given)}"
-        response.headers["Link"] = f'<{following}>; rel="next"'
+    following = paging.link_next(
+        response, f"{root}/v1/jobs", page.next_cursor, status=status, batch=batch, limit=limit
+    )
     jobs = [job_document(record, root=root, brief=True) for record in page.records]
     return JobList(jobs=jobs, next=following)
 

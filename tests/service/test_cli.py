@@ -317,10 +317,10 @@ def test_jobs_are_looked_after(served: Served, example: Path, tmp_path: Path) ->
 
 def test_serve_restarts_workers_and_leaves_nothing_behind(tmp_path: Path, example: Path) -> None:
     with serving(tmp_path, "--workers", "2", environment=clean_environment()) as server:
-        until(lambda: len(workers_of(server)) == 2)
-        first, _ = workers_of(server)
+        first, second = two_workers(server)
         os.kill(first, signal.SIGKILL)
-        until(lambda: len(workers_of(server)) == 2 and first not in workers_of(server))
+        until(lambda: first not in workers_of(server))
+        assert second in two_workers(server), "only the killed one is started again"
         succeeded(smsr("submit", example / "measurements.npy", "--wait", "--server", server.url))
         family = descendants(server.process.pid)
         assert len(family) >= 3, "Redis and two workers"
@@ -427,6 +427,18 @@ def workers_of(server: Served) -> list[int]:
         for pid, parent, _, command in processes()
         if parent == server.process.pid and "worker.main" in command
     ]
+
+
+def two_workers(server: Served) -> list[int]:
+    """Wait until there are two worker processes and return them."""
+    found: list[int] = []
+
+    def both() -> bool:
+        found[:] = workers_of(server)
+        return len(found) == 2
+
+    until(both)
+    return found
 
 
 def alive(pid: int) -> bool:

@@ -300,9 +300,9 @@ def test_curl_goes_on_where_it_was_killed_though_the_service_was_restarted(
             for what in ARCHIVES:
                 target = tmp_path / what
                 wholes[what] = httpx.get(f"{api.url}{job}/{what}")
-                limited = [curl, "-sS", "--limit-rate", "4M", "-o", str(target)]
+                limited = [curl, "-sS", "--limit-rate", "200k", "-o", str(target)]
                 with subprocess.Popen([*limited, f"{api.url}{job}/{what}"]) as process:
-                    wait_for(partial(has_bytes, target, 1_000_000))
+                    wait_for(partial(has_bytes, target, 100_000))
                     process.kill()
                 held = target.read_bytes()
                 assert len(held) < len(wholes[what].content)
