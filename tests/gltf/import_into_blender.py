@@ -8,7 +8,10 @@ import sys
 from pathlib import Path
 
 import bpy
+import numpy as np
 
+if not hasattr(np, "bool"):
+    vars(np)["bool"] = bool  # used by the importer of Blender 3.4, not in numpy 1.24 to 1.26
 source, out, *times = sys.argv[sys.argv.index("--") + 1 :]
 bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.import_scene.gltf(filepath=source)
