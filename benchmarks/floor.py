@@ -99,7 +99,7 @@ def measure(frames: int, points: int, repeats: int, folder: Path) -> None:
     ratios = np.median(ours / floor, axis=0)
     print(
         f"{points:9d}",
-        *(f"{value:9.3f}" for value in walls),
+        *(f"{value:9.3g}" for value in walls),
         *(f"{value:9.2f}" for value in ratios),
     )
 
