@@ -87,10 +87,10 @@ class DaskSource:
                 yield part, here[:, part.start - points.start : part.stop - points.start]
 
     def triangles(
-        self, shift: NDArray[np.float64], size: int, workers: int | None
+        self, shift: NDArray[np.float64], size: int, step: int, workers: int | None
     ) -> Iterator[tuple[int, Triangle]]:
-        """Reduce blocks of about `size` points where they are."""
-        return self.map(partial(_reduce, shift=shift), size, workers)
+        """Reduce blocks of about `size` points where they are, and keep every n-th point."""
+        return self.map(partial(triangle_of, shift=shift, step=step), size, workers)
 
     def map(
         self, work: Callable[[slice, NDArray[Any]], Result], size: int, workers: int | None
@@ -216,11 +216,6 @@ def _apply(
     work: Callable[[slice, NDArray[Any]], Result], points: slice, block: NDArray[Any]
 ) -> Result:
     return work(points, block)
-
-
-def _reduce(_points: slice, block: NDArray[Any], *, shift: NDArray[np.float64]) -> Triangle:
-    """Return what stays of a block."""
-    return triangle_of(block, shift)
 
 
 def _shapes(

@@ -105,9 +105,12 @@ class RemoteSource(MeasurementSource, Protocol):
         ...
 
     def triangles(
-        self, shift: NDArray[np.float64], size: int, workers: int | None
+        self, shift: NDArray[np.float64], size: int, step: int, workers: int | None
     ) -> Iterator[tuple[int, Triangle]]:
-        """Reduce blocks of about `size` points; yields the end of each block and its triangle."""
+        """Reduce blocks of about `size` points, and keep every n-th point.
+
+        Yields the end of each block and its triangle.
+        """
         ...
 
     def map_back(

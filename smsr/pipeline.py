@@ -176,8 +176,11 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     virtual = points.left * values
     noise = points.noise / _spread(space)
     with clock.stage("cameras") as hook:
-        estimate = estimate_cameras(points.left, values, options, hook, noise=noise)
-        rotations = fix_gauge(estimate.rotations)
+        real = points.coordinates @ space.sample
+        estimate = fix_gauge(
+            estimate_cameras(points.left, values, options, hook, points=real, noise=noise)
+        )
+        rotations = estimate.rotations
         clock.note(estimate)
     with clock.stage("smoothing") as hook:
         motion = _smooth(virtual, rotations, estimate.basis_size, options, hook)
@@ -192,6 +195,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             camera_model=estimate.model,
             coherent=estimate.coherent,
             simpler=estimate.simpler,
+            simpler_share=estimate.simpler_share,
             noise=noise,
             hook=hook,
         )

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 _EPS = float(np.finfo(np.float64).eps)
 _LARGEST = 1e150  # so that squares stay finite
 
+SAMPLE = 512
+"""Most points that are kept as they are."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowSpace:
@@ -63,6 +66,8 @@ class RowSpace:
         Of the centred W, largest first.
     frames, points : int
         T and N.
+    sample : ndarray of shape (2T, s), float64
+        Some points of the centred W, evenly spread: at most `SAMPLE`.
     """
 
     means: NDArray[np.float64]
@@ -70,6 +75,7 @@ class RowSpace:
     singular_values: NDArray[np.float64]
     frames: int
     points: int
+    sample: NDArray[np.float64]
 
     @property
     def left(self) -> NDArray[np.float64]:
@@ -121,15 +127,16 @@ def factorise(
     # Differences to a point of the data are exact or nearly so: a far translation is gone before
     # anything is added or multiplied, and costs no digits.
     size = _factor_chunk(source, chunk_bytes)
+    step = -(-source.points // SAMPLE)
     triangles: Iterator[tuple[int, Triangle]]
     if isinstance(source, RemoteSource):
         shift = source.first_point().astype(np.float64)
-        triangles = source.triangles(shift, size, workers)
+        triangles = source.triangles(shift, size, step, workers)
     else:
         chunks = checked_chunks(source, size)
         first = next(chunks)
         shift = first[1][:, 0].astype(np.float64)
-        work = partial(_reduce, shift=shift)
+        work = partial(triangle_of, shift=shift, step=step)
         triangles = map_chunks(work, chain([first], chunks), workers or blas_threads())
     waiting: list[Triangle] = []
     try:
@@ -142,11 +149,6 @@ def factorise(
         check_values(source)
         raise _too_large() from None
     return _row_space(merged(waiting), shift, source)
-
-
-def _reduce(_points: slice, block: NDArray[Any], *, shift: NDArray[np.float64]) -> Triangle:
-    """Return what stays of a block."""
-    return triangle_of(block, shift)
 
 
 def _factor_chunk(source: MeasurementSource, chunk_bytes: int) -> int:
@@ -177,6 +179,7 @@ def _row_space(total: Triangle, shift: NDArray[np.float64], source: MeasurementS
         singular_values=values[:rank],
         frames=source.frames,
         points=source.points,
+        sample=total.sample - total.mean[:, None],
     )
 
 

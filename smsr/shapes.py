@@ -268,6 +268,7 @@ def estimate_shapes(
     camera_model: str = "relaxed",
     coherent: bool = False,
     simpler: NDArray[np.float64] | None = None,
+    simpler_share: float = 0.0,
     noise: float = 0.0,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
@@ -286,12 +287,25 @@ def estimate_shapes(
     coherent : bool
         See `reweighted_shapes`.
     simpler : ndarray of shape (T, 3, 3), optional
-        See `smsr.cameras.CameraEstimate.simpler`.
+    simpler_share : float
+        See `smsr.cameras.CameraEstimate`.
     noise : float
         Standard deviation of the noise that was taken off, as a part of the tracks' spread.
     hook : callable
         See `smsr.progress.StageHook`.
     """
+    share = simpler_share * _trust(noise)
+    if simpler is not None and share == 1.0:
+        found = estimate_shapes(
+            measurements,
+            simpler,
+            options,
+            camera_model=camera_model,
+            coherent=coherent,
+            noise=noise,
+            hook=hook,
+        )
+        return dataclasses.replace(found, shapes=turned_to(found.shapes, simpler, rotations))
     limits: dict[str, Any] = {
         "max_iterations": options.shape_iterations,
         "tolerance": options.shape_tolerance,
@@ -310,16 +324,17 @@ def estimate_shapes(
     if options.shape_method == "auto" and camera_model == "rigid":
         return rigid_shapes(measurements, rotations)
     limits["motion_weight"] = options.motion_weight
-    found = reweighted_shapes(measurements, rotations, coherent=coherent, **limits)
+    limits["coherent"] = coherent
     if options.shape_method == "reweighted":
-        return found
-    if simpler is not None and _trust(noise) > 0.0:
+        return reweighted_shapes(measurements, rotations, **limits)
+    found = reweighted_shapes(measurements, rotations, **limits)
+    if simpler is not None and share > 0.0:
         other = reweighted_shapes(measurements, simpler, **limits)
-        found = with_mean_depth(found, rotations, other, simpler, noise)
+        found = with_mean_depth(found, rotations, other, simpler, share)
     found = credible_depth(found, rotations)
     if found.complexity < DOUBTFUL or _trust(noise) == 0.0:
         return found
-    deep = reweighted_shapes(measurements, rotations, coherent=coherent, deep=True, **limits)
+    deep = reweighted_shapes(measurements, rotations, deep=True, **limits)
     return with_deep_shapes(found, deep, rotations, noise)
 
 
@@ -637,17 +652,25 @@ def with_deep_shapes(
     )
 
 
+def turned_to(
+    shapes: NDArray[np.float64], others: NDArray[np.float64], rotations: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return shapes (T, 3, N) so that cameras see them as they were seen by others (T, 3, 3)."""
+    turned: NDArray[np.float64] = rotations.transpose(0, 2, 1) @ (others @ shapes)
+    return turned
+
+
 def with_mean_depth(
     estimate: ShapeEstimate,
     rotations: NDArray[np.float64],
     other: ShapeEstimate,
     others: NDArray[np.float64],
-    noise: float = 0.0,
+    share: float = 0.5,
 ) -> ShapeEstimate:
-    """Return shapes with the mean of the depths that two sets of cameras see.
+    """Return shapes with a mean of the depths that two sets of cameras see.
 
-    An object that turns as a whole looks simpler to cameras that turn with it. Their depths are
-    then the better ones, though their path is not the camera's.
+    An object that turns as a whole looks simpler to cameras that turn with it. Their depths may
+    then be the better ones, though their path is not the camera's.
 
     Parameters
     ----------
@@ -658,23 +681,17 @@ def with_mean_depth(
     other : ShapeEstimate
         Found with `others`.
     others : ndarray of shape (T, 3, 3)
-        Other cameras for the same tracks, perhaps mirrored.
-    noise : float
-        As a part of the tracks' spread: the more there was, the less do the other depths count.
+        Other cameras for the same tracks.
+    share : float
+        Weight of the other depths, 0 to 1.
     """
-    axis = rotations[:, 2]
-    depths = np.matmul(axis[:, None], estimate.shapes)[:, 0]
-    seen = np.matmul(others[:, 2][:, None], other.shapes)[:, 0]
-    if float((depths * seen).sum()) < 0.0:
-        seen = -seen
-    part = 0.5 * _trust(noise)
-    change = part * (seen - depths)
+    turned = turned_to(other.shapes, others, rotations)
     return dataclasses.replace(
         estimate,
-        shapes=estimate.shapes + axis[:, :, None] * change[:, None],
+        shapes=estimate.shapes + share * (turned - estimate.shapes),
         iterations=estimate.iterations + other.iterations,
         converged=estimate.converged and other.converged,
-        reason=f"{estimate.reason}; free cameras, {part:.0%} of their depths: {other.reason}",
+        reason=f"{estimate.reason}; free cameras, {share:.0%} of their depths: {other.reason}",
     )
 
 

@@ -8,6 +8,7 @@ their means.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -42,22 +43,36 @@ class Triangle:
     rows : ndarray of shape (k, 2T)
         Few rows with the Gram matrix of the points about their mean: those points themselves
         where they are few, otherwise the triangular factor or any other.
+    sample : ndarray of shape (2T, s)
+        Some of the points themselves, relative to the shift, in their order.
     """
 
     count: int
     mean: NDArray[np.float64]
     rows: NDArray[np.float64]
+    sample: NDArray[np.float64]
 
 
-def triangle_of(block: NDArray[Any], shift: NDArray[np.float64]) -> Triangle:
+def every_nth(points: slice, step: int) -> slice:
+    """Return where in a block of points those stand whose number is a multiple of `step`."""
+    return slice(-points.start % step, points.stop - points.start, step)
+
+
+def triangle_of(
+    points: slice, block: NDArray[Any], *, shift: NDArray[np.float64], step: int
+) -> Triangle:
     """Reduce a block of points.
 
     Parameters
     ----------
+    points : slice
+        The numbers of the points.
     block : ndarray of shape (2T, n)
         Of any real type; converted to double precision part by part.
     shift : ndarray of shape (2T,)
         What the coordinates are taken relative to.
+    step : int
+        Points whose number is a multiple of this are kept as they are, too.
 
     Raises
     ------
@@ -65,11 +80,14 @@ def triangle_of(block: NDArray[Any], shift: NDArray[np.float64]) -> Triangle:
         NaN or infinity in the block, or overflow.
     """
     with np.errstate(invalid="ignore", over="ignore"):
+        triangle = None
         if block.shape[1] >= _MANY * block.shape[0]:
-            whitened = _triangle_by_whitening(block, shift)
-            if whitened is not None:
-                return whitened
-        return _triangle_by_householder(block, shift)
+            triangle = _triangle_by_whitening(block, shift)
+        if triangle is None:
+            triangle = _triangle_by_householder(block, shift)
+        return dataclasses.replace(
+            triangle, sample=block[:, every_nth(points, step)] - shift[:, None]
+        )
 
 
 def _triangle_by_householder(block: NDArray[Any], shift: NDArray[np.float64]) -> Triangle:
@@ -84,7 +102,7 @@ def _triangle_by_householder(block: NDArray[Any], shift: NDArray[np.float64]) ->
         np.subtract(columns, shift[:, None], out=centred)
         mean = _finite(centred.mean(axis=1))
         centred -= mean[:, None]
-        parts.append(Triangle(columns.shape[1], mean, _reduced(centred.T)))
+        parts.append(Triangle(columns.shape[1], mean, _reduced(centred.T), buffer[:, :0]))
     return merged(parts)
 
 
@@ -123,7 +141,8 @@ def _triangle_by_whitening(block: NDArray[Any], shift: NDArray[np.float64]) -> T
     if not spectrum[0] > spectrum[-1] / _WELL_CONDITIONED:
         return None
     colour = scales[:, None] * axes
-    return Triangle(count, centre + total @ colour / count, np.linalg.cholesky(gram).T @ colour)
+    mean = centre + total @ colour / count
+    return Triangle(count, mean, np.linalg.cholesky(gram).T @ colour, centred[:, :0])
 
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -156,4 +175,5 @@ def merged(parts: Iterable[Triangle]) -> Triangle:
     mean = counts @ means / count
     between = np.sqrt(counts)[:, None] * (means - mean)
     rows = np.concatenate([part.rows for part in parts] + [between])
-    return Triangle(count, mean, _reduced(rows))
+    sample = np.concatenate([part.sample for part in parts], axis=1)
+    return Triangle(count, mean, _reduced(rows), sample)

@@ -24,7 +24,8 @@ class CameraEstimate:
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     model : str
-        How they were found: 'relaxed', 'uniform', 'switched', 'rigid' or 'paper'.
+        How they were found: 'relaxed', 'uniform', 'switched', 'accelerated', 'eased', 'swinging',
+        'axis', 'rigid' or 'paper'.
     basis_size : int
         K, the number of column triplets of the corrective matrix.
     iterations : int
@@ -41,8 +42,10 @@ class CameraEstimate:
     coherent : bool
         Whether a simple path of the camera made the object move no more.
     simpler : ndarray of shape (T, 3, 3), optional
-        The free cameras that gave way to a simple path, in a frame of their own and perhaps
-        mirrored, where the shapes that they give are clearly simpler: they turn with the object.
+        The free cameras that gave way to others. Shapes are simpler for them, as they turn with the
+        object.
+    simpler_share : float
+        How much of the depths that they see is to be taken, 0 to 1.
     """
 
     rotations: NDArray[np.float64]
@@ -55,6 +58,7 @@ class CameraEstimate:
     criteria: Mapping[str, float] = field(default_factory=dict)
     coherent: bool = False
     simpler: NDArray[np.float64] | None = None
+    simpler_share: float = 0.0
 
 
 def scaled_motion(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,8 +12,10 @@ from smsr import rotations as so3
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from smsr.cameras.estimate import CameraEstimate
 
-def fix_gauge(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+
+def fix_gauge(estimate: CameraEstimate) -> CameraEstimate:
     """Turn the object frame so that the camera of the middle frame is the identity.
 
     Of the two mirror images that an orthographic camera cannot tell apart, the one is taken whose
@@ -21,15 +24,25 @@ def fix_gauge(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    rotations : ndarray of shape (T, 3, 3)
-        Cameras completed by the viewing direction, in any object frame.
+    estimate : CameraEstimate
+        Cameras in any object frame.
 
     Returns
     -------
-    ndarray of shape (T, 3, 3)
+    CameraEstimate
         Cameras of the same motion; shapes have to be found (or turned) for them.
     """
-    fixed: NDArray[np.float64] = rotations @ rotations[len(rotations) // 2].T
+    middle = estimate.rotations[len(estimate.rotations) // 2]
+    rotations = estimate.rotations @ middle.T
+    simpler = None if estimate.simpler is None else estimate.simpler @ middle.T
+    if _turns_negatively(rotations):
+        rotations = so3.mirror(rotations)
+        simpler = None if simpler is None else so3.mirror(simpler)
+    return dataclasses.replace(estimate, rotations=rotations, simpler=simpler)
+
+
+def _turns_negatively(fixed: NDArray[np.float64]) -> bool:
+    """Tell which of the two mirror images cameras (T, 3, 3) belong to."""
     tilt = fixed[:, :2, 2]
     time = np.arange(len(tilt)) - (len(tilt) - 1) / 2
     trend = time @ tilt
@@ -40,4 +53,4 @@ def fix_gauge(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
         largest = np.abs(flat).max()
     # Among components of nearly the same size take the first, so that rounding decides nothing.
     decisive = trend[np.argmax(np.abs(trend) >= 0.999 * largest)]
-    return so3.mirror(fixed) if decisive < 0.0 else fixed
+    return bool(decisive < 0.0)

@@ -8,19 +8,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smsr import rotations as so3
+from smsr.cameras.axis import fit_axis
 from smsr.cameras.constraints import (
     frame_products,
     orthonormality_form,
     symmetric_matrix,
     symmetric_vector,
 )
-from smsr.cameras.estimate import scaled_motion, usable_rank
+from smsr.cameras.estimate import CameraEstimate, scaled_motion, usable_rank
 from smsr.cameras.free import angle_between, complexity, free_cameras
 from smsr.cameras.gauge import fix_gauge
+from smsr.cameras.paces import fit_paces
 from smsr.cameras.paper import published_cameras, thresholded_factor
 from smsr.cameras.relaxed import relaxed_cameras, relaxed_factor
+from smsr.cameras.rest import resting_frame
 from smsr.cameras.rigid import rigid_cameras
-from smsr.cameras.selection import part_outside_span, with_simple_path
+from smsr.cameras.selection import part_outside_span, with_simple_path, with_uniform_path
 from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
 from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
@@ -364,15 +367,133 @@ class TestSwitched:
         assert correlation_length(np.repeat(noise, 5, axis=0)) > 3.0
 
 
+def about_one_axis(angles: Array) -> Array:
+    """Return rotations by angles (T,), radians, about a tilted axis."""
+    axis = np.array([0.2, 1.0, 0.1])
+    vectors = angles[:, None] * axis / np.linalg.norm(axis)
+    start = so3.exp(np.array([[0.4, -0.3, 0.2]]))
+    return so3.exp(vectors) @ start
+
+
+def accelerating(frames: int) -> Array:
+    return about_one_axis(np.radians(np.cumsum(np.linspace(1.0, 6.0, frames))))
+
+
+def easing(frames: int) -> Array:
+    time = np.linspace(0.0, 1.0, frames)
+    return about_one_axis(6.0 * (time - 0.8) ** 3 - 2.0 * time)
+
+
+def pendulum(frames: int) -> Array:
+    return about_one_axis(0.9 * np.sin(np.linspace(0.5, 13.0, frames)))
+
+
+class TestAxis:
+    def test_any_turn_about_an_axis_is_found(self) -> None:
+        angles = np.cumsum(np.random.default_rng(0).uniform(-0.1, 0.3, 200))
+        true = about_one_axis(angles)
+        fit = fit_axis(true)
+        assert np.linalg.norm(fit.tilt, axis=1).max() < 1e-7
+        np.testing.assert_allclose(fit.turn().rotations, true, atol=1e-7)
+        np.testing.assert_allclose(np.abs(np.diff(fit.angles)), np.abs(np.diff(angles)), atol=1e-7)
+        assert fit.is_followed()
+
+    def test_frames_that_are_far_off_count_little(self) -> None:
+        true = about_one_axis(np.linspace(0.0, 5.0, 100))
+        found = true.copy()
+        found[::10] = Rotation.random(10, random_state=0).as_matrix()
+        turned = fit_axis(found).turn().rotations
+        assert so3.angles_between(turned, true)[1::10].max() < 0.05
+
+    def test_it_tells_what_the_object_does_from_what_the_camera_does(self) -> None:
+        turning = about_one_axis(np.linspace(0.0, 12.0, 200))
+        rocking = np.zeros((200, 3))
+        rocking[:, 0] = 0.15 * np.sin(np.linspace(0.0, 9.0, 200))
+        assert fit_axis(turning @ so3.exp(rocking)).is_followed()
+        assert not fit_axis(so3.exp(rocking) @ turning).is_followed()
+
+    def test_what_hardly_turns_or_turns_anyhow_follows_no_axis(self) -> None:
+        assert not fit_axis(about_one_axis(np.radians(np.linspace(0.0, 10.0, 50)))).is_followed()
+        assert not fit_axis(swing(80)).is_followed()
+
+
+class TestPaces:
+    @pytest.mark.parametrize(
+        ("index", "name", "function"),
+        [
+            (0, "accelerated", lambda t: 2.0 + t + 0.7 * t**2),
+            (1, "eased", lambda t: t**2 * (3.0 - 2.0 * t)),
+            (2, "swinging", lambda t: 0.5 + 0.8 * np.sin(11.0 * t + 0.3)),
+            (3, "swinging", lambda t: 3.0 * t + 0.4 * np.cos(8.0 * t)),
+        ],
+    )
+    @pytest.mark.parametrize("frames", [60, 1000])
+    def test_each_finds_its_own_function(
+        self, index: int, name: str, function: Callable[[Array], Array], frames: int
+    ) -> None:
+        angles = function(np.linspace(0.0, 1.0, frames))
+        spoilt = angles.copy()
+        spoilt[np.random.default_rng(0).choice(frames, frames // 30, replace=False)] += 1.0
+        pace = fit_paces(spoilt)[index]
+        assert pace.name == name
+        assert pace.parameters == (1, 2, 2, 3)[index]
+        np.testing.assert_allclose(pace.angles, angles, atol=0.02)
+
+
+class TestRest:
+    @staticmethod
+    def drifting(resting: int) -> tuple[Array, Array]:
+        """Return shapes (T, 3, N) that drift, some of their points at rest, and how to undo it."""
+        rng = np.random.default_rng(0)
+        shape = rng.standard_normal((3, 40))
+        phases = np.linspace(0.0, 9.0, 50)[:, None, None] + rng.uniform(0.0, 6.0, (1, 3, 40))
+        moves = 0.6 * np.sin(phases)
+        moves[:, :, :resting] = 0.0
+        shapes = shape + moves
+        shapes -= shapes.mean(axis=2, keepdims=True)
+        drift = so3.exp(
+            0.2 * np.sin(np.linspace(0.0, 4.0, 50))[:, None] * np.array([1.0, 0.5, 0.2])
+        )
+        return drift @ shapes, drift.transpose(0, 2, 1)
+
+    def test_points_that_rest_show_the_drift(self) -> None:
+        shapes, undone = self.drifting(resting=15)
+        rest = resting_frame(shapes)
+        assert rest.trust == 1.0
+        assert camera_error(rest.turns.transpose(0, 2, 1), undone.transpose(0, 2, 1)) < 0.03
+
+    def test_where_all_points_move_they_show_nothing(self) -> None:
+        rest = resting_frame(self.drifting(resting=0)[0])
+        assert rest.unrest > 0.3
+        assert rest.trust == 0.0
+
+    def test_what_does_not_move_at_all(self) -> None:
+        still = np.broadcast_to(np.random.default_rng(0).standard_normal((3, 9)), (5, 3, 9))
+        for shapes in (still, np.zeros((5, 3, 9))):
+            turns = resting_frame(shapes).turns
+            np.testing.assert_allclose(turns, np.broadcast_to(turns[0], turns.shape), atol=1e-9)
+
+
 class TestSelection:
-    @pytest.mark.parametrize(("path", "model"), [(orbit, "uniform"), (reversing, "switched")])
+    @pytest.mark.parametrize(
+        ("path", "model"),
+        [
+            (orbit, "uniform"),
+            (reversing, "switched"),
+            (accelerating, "accelerated"),
+            (easing, "eased"),
+            (pendulum, "swinging"),
+        ],
+    )
     def test_a_simple_path_is_recognised(self, path: Callable[[int], Array], model: str) -> None:
         true = path(120)
         left, values = low_rank(true, modes=2)
         free = relaxed_cameras(left, values)
         estimate = with_simple_path(free, left * values)
         assert estimate.model == model
-        assert f"{model} turn" in estimate.reason
+        assert estimate.reason.startswith(
+            ("a uniform turn", "a switched turn", "an accel", "a turn", "a swing")
+        )
         assert estimate.criteria[f"{model}_unexplained"] < 0.1
         assert camera_error(estimate.rotations, true) < 0.06
 
@@ -387,12 +508,29 @@ class TestSelection:
             estimate = with_simple_path(free, left * values)
             assert estimate.model == "relaxed"
             np.testing.assert_array_equal(estimate.rotations, free.rotations)
-            assert "uniform turn" in estimate.reason
+
+    def test_points_at_rest_take_the_drift_of_free_cameras_away(self) -> None:
+        true = swing(80)
+        shapes = TestRest.drifting(resting=15)[0][:1] + np.zeros((80, 1, 1))
+        shapes[:, :, 15:] += 0.5 * np.sin(np.linspace(0.0, 9.0, 80))[:, None, None]
+        shapes -= shapes.mean(axis=2, keepdims=True)
+        W = (true[:, :2] @ shapes).reshape(160, -1)
+        U, s, Vt = np.linalg.svd(W, full_matrices=False)
+        kept = s > 1e-10 * s[0]
+        left, values = U[:, kept], s[kept] / s[0]
+        drift = so3.exp(0.15 * np.sin(np.linspace(0.0, 5.0, 80))[:, None] * np.array([0.6, 0.8, 0]))
+        free = CameraEstimate(true @ drift, "relaxed", 2, 1, True, "drifting on purpose")
+        estimate = with_simple_path(free, left * values, points=Vt[kept])
+        assert estimate.model == "relaxed"
+        assert estimate.criteria["unrest"] < 0.16
+        assert estimate.simpler is free.rotations
+        assert estimate.simpler_share == 1.0
+        assert angle_between(estimate.rotations, true) < 0.4 * angle_between(free.rotations, true)
 
     def test_it_can_be_forced(self) -> None:
         left, values = low_rank(swing(20))
         free = relaxed_cameras(left, values)
-        estimate = with_simple_path(free, left * values, force=True)
+        estimate = with_uniform_path(free, left * values)
         assert estimate.model == "uniform"
         steps = so3.log(estimate.rotations[1:] @ estimate.rotations[:-1].transpose(0, 2, 1))
         np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-9)
@@ -404,9 +542,13 @@ class TestSelection:
 
 
 class TestGauge:
+    @staticmethod
+    def fixed(rotations: Array) -> Array:
+        return fix_gauge(CameraEstimate(rotations, "relaxed", 1, 1, True, "")).rotations
+
     def test_middle_camera_becomes_the_identity_and_motion_stays(self) -> None:
         G = swing(21)
-        fixed = fix_gauge(G)
+        fixed = self.fixed(G)
         np.testing.assert_allclose(fixed[10], np.eye(3), atol=1e-12)
         assert camera_error(fixed, G) < 1e-12
 
@@ -414,8 +556,18 @@ class TestGauge:
         G = swing(30)
         turn = Rotation.random(random_state=3).as_matrix()
         for same in (G @ turn, so3.mirror(G), so3.mirror(G) @ turn):
-            np.testing.assert_allclose(fix_gauge(same), fix_gauge(G), atol=1e-12)
+            np.testing.assert_allclose(self.fixed(same), self.fixed(G), atol=1e-12)
+
+    def test_other_cameras_of_the_estimate_keep_their_place(self) -> None:
+        G, others = swing(21), swing(21) @ so3.exp(np.full((21, 3), 0.2))
+        for same, simpler in ((G, others), (so3.mirror(G), so3.mirror(others))):
+            estimate = CameraEstimate(same, "relaxed", 1, 1, True, "", simpler=simpler)
+            fixed = fix_gauge(estimate)
+            assert fixed.simpler is not None
+            relative = fixed.rotations.transpose(0, 2, 1) @ fixed.simpler
+            angles = so3.angles_between(relative, np.broadcast_to(np.eye(3), (21, 3, 3)))
+            np.testing.assert_allclose(angles, 0.2 * np.sqrt(3.0), atol=1e-12)
 
     def test_still_camera(self) -> None:
         still = np.broadcast_to(np.eye(3), (5, 3, 3))
-        np.testing.assert_allclose(fix_gauge(still), still)
+        np.testing.assert_allclose(self.fixed(still), still)

@@ -210,15 +210,17 @@ def test_reduction_equals_the_run_on_all_points(preset: str) -> None:
     reduced = reconstruct(W, preset=preset, smoothing=False, noise=0.0)
     options = resolve(Options(preset=preset), points=60)  # type: ignore[arg-type]
     centred = W - W.mean(axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(centred, full_matrices=False)
-    estimate = estimate_cameras(left, values / values[0], options)
-    rotations = fix_gauge(estimate.rotations)
+    left, values, right = np.linalg.svd(centred, full_matrices=False)
+    estimate = fix_gauge(estimate_cameras(left, values / values[0], options, points=right))
+    rotations = estimate.rotations
     shapes = estimate_shapes(
         centred / values[0],
         rotations,
         options,
         camera_model=estimate.model,
         coherent=estimate.coherent,
+        simpler=estimate.simpler,
+        simpler_share=estimate.simpler_share,
     ).shapes
     np.testing.assert_allclose(reduced.cameras, rotations[:, :2], atol=1e-8)
     expected = values[0] * shapes.transpose(0, 2, 1)

@@ -299,14 +299,23 @@ class TestTwoSolutions:
         none = with_deep_shapes(found, deep, rotations).shapes
         assert 0.9 < relative_error(little, found.shapes) / relative_error(none, found.shapes) < 1.0
 
-    @pytest.mark.parametrize("mirrored", [False, True])
-    def test_mean_depth_of_the_same_cameras_in_another_frame(self, mirrored: bool) -> None:
+    def test_mean_depth_of_the_same_cameras_in_another_frame(self) -> None:
         W, rotations, _ = sequence(modes=2)
         others = rotations @ so3.exp(np.array([[0.3, -0.2, 0.9]]))
-        others = so3.mirror(others) if mirrored else others
         found, other = low_rank_shapes(W, rotations), low_rank_shapes(W, others)
         mean = with_mean_depth(found, rotations, other, others)
         assert relative_error(mean.shapes, found.shapes) < 1e-3
+
+    def test_mean_depth_lies_between_and_keeps_the_tracks(self) -> None:
+        W, rotations, _ = sequence(modes=2)
+        others = rotations @ so3.exp(np.linspace(0.0, 0.3, len(rotations))[:, None] * np.eye(3)[:1])
+        found, other = low_rank_shapes(W, rotations), low_rank_shapes(W, others)
+        seen = others @ other.shapes
+        for share in (0.3, 1.0):
+            mean = rotations @ with_mean_depth(found, rotations, other, others, share).shapes
+            np.testing.assert_allclose(mean[:, :2].reshape(W.shape), W, atol=1e-9)
+            depths = (1.0 - share) * (rotations @ found.shapes)[:, 2] + share * seen[:, 2]
+            np.testing.assert_allclose(mean[:, 2], depths, atol=1e-9)
 
 
 class TestRigid:

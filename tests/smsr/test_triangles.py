@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from smsr import triangles
-from smsr.triangles import NotUsableError, Triangle, merged, triangle_of
+from smsr.triangles import NotUsableError, Triangle, every_nth, merged
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,6 +19,11 @@ def points(width: int, count: int, seed: int = 0) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
     mixing = rng.standard_normal((width, width))
     return mixing @ rng.standard_normal((width, count)) + rng.standard_normal((width, 1))
+
+
+def triangle_of(block: NDArray[np.float64], shift: NDArray[np.float64]) -> Triangle:
+    """Reduce a block of points that stands alone."""
+    return triangles.triangle_of(slice(0, block.shape[1]), block, shift=shift, step=1000)
 
 
 def assert_stands_for(triangle: Triangle, X: NDArray[np.float64], tolerance: float) -> None:
@@ -48,6 +54,20 @@ def test_joined_parts_stand_for_the_whole(width: int, count: int, cuts: set[int]
     shift = X[:, 0]
     parts = [triangle_of(part, shift) for part in np.split(X, inside, axis=1)]
     assert_stands_for(merged(parts), X - shift[:, None], 1e-9)
+
+
+@pytest.mark.parametrize("cuts", [(), (1, 2, 40), (7, 29)])
+@pytest.mark.parametrize("step", [1, 7, 100])
+def test_every_nth_point_is_kept_however_blocks_are_cut(cuts: tuple[int, ...], step: int) -> None:
+    X = points(4, 60)
+    shift = X[:, 0]
+    edges = [0, *cuts, 60]
+    parts = [
+        triangles.triangle_of(slice(start, stop), X[:, start:stop], shift=shift, step=step)
+        for start, stop in itertools.pairwise(edges)
+    ]
+    np.testing.assert_array_equal(merged(parts).sample, X[:, ::step] - shift[:, None])
+    assert every_nth(slice(10, 20), 8) == slice(6, 10, 8)
 
 
 @pytest.mark.parametrize("count", [5, 12, 13, 767, 768, 50_000])

@@ -1,0 +1,96 @@
+"""How the angle of a turn may go on in time: simple functions, of few parameters.
+
+The angle of free cameras about the axis of their turn is the camera's angle and the object's own
+turn. A camera that is led by a machine, or by a steady hand, follows a function that can be named.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_ROUNDS = 8
+_OUTLIER = 2.0  # of the residual's spread
+_CYCLES = np.arange(0.4, 8.0, 0.05)  # of a swing, over the whole sequence
+_FINER = np.linspace(-0.05, 0.05, 21)
+_FRAMES = 400  # as many tell the frequency of a swing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pace:
+    """A function of time fitted to the angles of a turn.
+
+    Attributes
+    ----------
+    name : str
+        Of the kind of turn.
+    angles : ndarray of shape (T,)
+        Radians.
+    parameters : int
+        Beyond the two of a constant velocity.
+    """
+
+    name: str
+    angles: NDArray[np.float64]
+    parameters: int
+
+
+def fit_paces(angles: NDArray[np.float64]) -> list[Pace]:
+    """Fit a changing velocity, an easing in and out, and swings to angles (T,)."""
+    time = np.linspace(-1.0, 1.0, len(angles), dtype=np.float64)
+    return [
+        Pace("accelerated", robust_fit(_polynomials(time, 2), angles), 1),
+        Pace("eased", robust_fit(_polynomials(time, 3), angles), 2),
+        Pace("swinging", fit_swing(time, angles, 0), 2),
+        Pace("swinging", fit_swing(time, angles, 1), 3),
+    ]
+
+
+def _polynomials(time: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Return the Legendre polynomials (T, degree + 1) at times within -1 and 1."""
+    return np.asarray(legvander(time, degree), np.float64)
+
+
+def robust_fit(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the combination of basis functions (T, k) nearest to values (T,), by Huber's loss."""
+    weights = np.ones(len(values))
+    fitted = values
+    for _ in range(_ROUNDS):
+        roots = np.sqrt(weights)
+        coefficients = np.linalg.lstsq(basis * roots[:, None], values * roots, rcond=None)[0]
+        fitted = basis @ coefficients
+        off = np.abs(values - fitted)
+        spread = max(1.4826 * float(np.median(off)), np.finfo(float).tiny)
+        weights = 1.0 / np.maximum(1.0, off / (_OUTLIER * spread))
+    return fitted
+
+
+def fit_swing(
+    time: NDArray[np.float64], angles: NDArray[np.float64], degree: int
+) -> NDArray[np.float64]:
+    """Fit a sine, of the best frequency, on top of a polynomial to angles (T,)."""
+
+    def basis(time: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
+        phase = np.pi * cycles * time
+        return np.column_stack([_polynomials(time, degree), np.sin(phase), np.cos(phase)])
+
+    step = -(-len(angles) // _FRAMES)
+    some_time, some = time[::step], angles[::step]
+
+    def rest(cycles: float) -> float:
+        some_basis = basis(some_time, cycles)
+        coefficients = np.linalg.lstsq(some_basis, some, rcond=None)[0]
+        return float(((some - some_basis @ coefficients) ** 2).sum())
+
+    def rest_of_most(cycles: float) -> float:
+        return float(np.abs(some - robust_fit(basis(some_time, cycles), some)).sum())
+
+    cycles = min(_CYCLES.tolist(), key=rest)
+    cycles = min((cycles + _FINER).tolist(), key=rest_of_most)
+    return robust_fit(basis(time, cycles), angles)

@@ -1,0 +1,78 @@
+"""The frame in which most of an object rests.
+
+Free cameras turn with the object as a whole, for its shapes are simplest then. But feet stand on
+the ground, a skull does not move with its mouth: where some points hardly move, they tell a frame
+that is nearer to that of the world than the one in which all points move least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smsr import rotations as so3
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_POWER = 0.5
+_ROUNDS = 60
+_NEAR = 0.02  # of the object's size; what moves less is at rest
+_QUIET_PART = 0.1  # of the points
+_RESTING = (0.16, 0.22)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rest:
+    """How to turn the shape of each frame, so that the points that can rest do.
+
+    Attributes
+    ----------
+    turns : ndarray of shape (T, 3, 3)
+        Q; the shapes at rest are ``Q_t S_t``.
+    unrest : float
+        How far the quietest tenth of the points moves, relative to all.
+    """
+
+    turns: NDArray[np.float64]
+    unrest: float
+
+    @property
+    def trust(self) -> float:
+        """How much of the turns to apply, 0 to 1: all where points rest, nothing where none do."""
+        low, high = _RESTING
+        return min(max((high - self.unrest) / (high - low), 0.0), 1.0)
+
+
+def resting_frame(shapes: NDArray[np.float64]) -> Rest:
+    """Align the shapes of all frames to a mean shape, by the points that move least.
+
+    A generalised Procrustes analysis (Gower 1975) of rotations and translations that minimises
+    ``sum_t sum_n ||Q_t s_tn + c_t - m_n||^(1/2)`` by iteratively reweighted least squares. Small
+    distances weigh most, so the points at rest, if there are any, decide.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (T, 3, N)
+        S.
+    """
+    size = float(np.linalg.norm(shapes, axis=1).mean())
+    near = max((_NEAR * size) ** 2, np.finfo(float).tiny)
+    turned = shapes
+    weights = np.ones((len(shapes), 1, shapes.shape[2]))
+    for _ in range(_ROUNDS):
+        mean = (weights * turned).sum(axis=0) / weights.sum(axis=0)
+        total = weights.sum(axis=2, keepdims=True)
+        centre = (weights * shapes).sum(axis=2, keepdims=True) / total
+        centre_of_mean = (weights * mean).sum(axis=2, keepdims=True) / total
+        moments = (weights * (mean - centre_of_mean)) @ (shapes - centre).transpose(0, 2, 1)
+        turns = so3.nearest_rotations(moments)
+        turned = turns @ (shapes - centre) + centre_of_mean
+        squares = ((turned - mean) ** 2).sum(axis=1, keepdims=True)
+        weights = (squares + near) ** (_POWER / 2.0 - 1.0)
+        weights /= weights.mean()
+    moved = np.sqrt(squares.mean(axis=(0, 1)))
+    overall = max(float(np.sqrt((moved**2).mean())), np.finfo(float).tiny)
+    return Rest(turns, float(np.quantile(moved, _QUIET_PART)) / overall)

@@ -1,0 +1,220 @@
+"""Simple paths of the camera on trial: whether one may take the place of free cameras.
+
+A path is taken where it passes four tests: it is the simplest that fits, it leaves little of the
+free cameras unexplained, the shapes it gives do not move more, and it lies in the span of the
+tracks (`smsr.cameras.selection`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from smsr import rotations as so3
+from smsr.cameras.axis import fit_axis
+from smsr.cameras.paces import fit_paces
+from smsr.cameras.rest import resting_frame
+from smsr.cameras.switched import fit_switched_turn
+from smsr.cameras.turn import with_shake
+from smsr.cameras.uniform import fit_uniform_turn
+from smsr.shapes import DepthProblem
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smsr.cameras.turn import Turn
+
+UNEXPLAINED_LIMIT = 0.1
+"""Part of the rotation variance of the free cameras that a path may leave unexplained."""
+
+UNEXPLAINED_LITTLE = 0.035
+"""Part below which the path may even make the object move somewhat more."""
+
+MOTION_RISE_LIMIT = 0.35
+"""By how much more: log of the ratio of ||D S#||^2."""
+
+COST_OF_A_PARAMETER = 0.55
+"""By how much one parameter more has to lower the log of what a path leaves unexplained."""
+
+FLOOR = 0.02
+"""Radians; a path that follows the free cameras more closely than this is not better for it."""
+
+_FREE_ANGLES = 6  # as many parameters as a turn counts that goes on in any way about one axis
+_MOTION_WEIGHT = 1.5
+_REST_SMOOTHING = 4.0  # frames
+_SWITCH = 0.3  # change of the velocity from a frame to the next, in parts of it
+_SWITCHES_PER_PARAMETER = 4  # a switch within a frame shows in two, and its level is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """A path of few parameters.
+
+    Attributes
+    ----------
+    name : str
+        The camera model that it makes.
+    turn : Turn
+        With the shake of the cameras, where it is known.
+    parameters : int
+        Beyond those of a uniform turn.
+    unexplained : float
+        Mean squared angle, radians, by which free cameras drift from it.
+    """
+
+    name: str
+    turn: Turn
+    parameters: int = 0
+    unexplained: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """An information criterion: the path of the lowest is the most likely one."""
+        return math.log(self.unexplained + FLOOR**2) + COST_OF_A_PARAMETER * self.parameters
+
+    def __str__(self) -> str:
+        return {
+            "axis": "a turn about one axis",
+            "accelerated": "an accelerated turn",
+            "eased": "a turn that eases in or out",
+            "swinging": "a swing",
+        }.get(self.name, f"a {self.name} turn")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """What became of a path.
+
+    Attributes
+    ----------
+    unexplained : float
+        Part of the rotation variance of the free cameras.
+    reason : str
+        For a person.
+    motion_rise : float, optional
+        Log of the ratio of ||D S#||^2 to that with the free cameras, where it was measured.
+    motion_weight : float, optional
+        Weight of motion in the energy that the path minimises; None where it was refused.
+    simplicity : float
+        Nuclear norm of the shapes with the free cameras over that on the path.
+    """
+
+    unexplained: float
+    reason: str
+    motion_rise: float | None = None
+    motion_weight: float | None = None
+    simplicity: float = 1.0
+
+
+class Trial:
+    """The free cameras that paths are judged against.
+
+    Parameters
+    ----------
+    measurements : ndarray of shape (2T', q)
+        Virtual points in every n-th frame.
+    rotations : ndarray of shape (T, 3, 3)
+        Free cameras of all frames.
+    step : int
+        n.
+    """
+
+    def __init__(
+        self, measurements: NDArray[np.float64], rotations: NDArray[np.float64], step: int
+    ) -> None:
+        self.measurements = measurements
+        self.rotations = rotations
+        self.step = step
+        self._free = self._solve(rotations[::step])
+
+    def come_to_rest(self, points: NDArray[np.float64]) -> tuple[float, float]:
+        """Turn the free cameras to the frame in which points rest, as far as some do.
+
+        Parameters
+        ----------
+        points : ndarray of shape (q, s)
+            Real points as combinations of the virtual ones.
+
+        Returns
+        -------
+        unrest, trust : float
+            See `smsr.cameras.rest.Rest`.
+        """
+        rest = resting_frame(self._free.shapes.reshape(self._free.frames, 3, -1) @ points)
+        if rest.trust > 0.0:
+            # Drift is slow. What changes fast are errors, which would be taken for a shake.
+            turns = so3.log(rest.turns @ so3.mean_rotation(rest.turns).T)
+            turns = gaussian_filter1d(turns, _REST_SMOOTHING / self.step, axis=0, mode="nearest")
+            frames = np.arange(len(self.rotations))
+            every = np.stack([np.interp(frames, frames[:: self.step], x) for x in turns.T], axis=1)
+            self.rotations = self.rotations @ so3.exp(-rest.trust * every)
+        return rest.unrest, rest.trust
+
+    def paths(self) -> list[Path]:
+        """Return the most likely path, and as the next one any turn about the same axis.
+
+        There is none where the cameras do not keep to an axis.
+        """
+        axis = fit_axis(self.rotations)
+        if not axis.is_followed():
+            return []
+        found = [Path("uniform", fit_uniform_turn(self.rotations))]
+        switched = fit_switched_turn(self.rotations)
+        if switched is not None:
+            changes = int((np.abs(np.diff(switched.angles, 2)) > _SWITCH).sum())
+            found.append(Path("switched", switched, 1 + changes // _SWITCHES_PER_PARAMETER))
+        found += [
+            Path(pace.name, axis.turn(pace.angles), pace.parameters)
+            for pace in fit_paces(axis.angles)
+        ]
+        anyhow = self._with_shake(Path("axis", axis.turn(), _FREE_ANGLES))
+        best = min([self._with_shake(path) for path in found], key=lambda path: path.score)
+        return [best, anyhow] if best.score < anyhow.score else [anyhow]
+
+    def _with_shake(self, path: Path) -> Path:
+        turn, drift = with_shake(path.turn, self.rotations)
+        return dataclasses.replace(
+            path, turn=turn, unexplained=float((drift**2).sum(axis=1).mean())
+        )
+
+    def judge(self, path: Path) -> Verdict:
+        """Put a path to the tests."""
+        spread = ((self.rotations - self.rotations.mean(axis=0)) ** 2).sum(axis=(1, 2)).mean()
+        # ||G - H||_F^2 is twice the squared angle between G and H, to second order.
+        unexplained = 2.0 * path.unexplained / max(float(spread), np.finfo(float).tiny)
+        if unexplained > UNEXPLAINED_LIMIT:
+            return Verdict(unexplained, f"leaves {unexplained:.1%} of the rotation unexplained")
+        verdict = self.measure(path, unexplained)
+        rise = verdict.motion_rise or 0.0
+        if rise <= (MOTION_RISE_LIMIT if unexplained <= UNEXPLAINED_LITTLE else 0.0):
+            return verdict
+        return dataclasses.replace(verdict, motion_weight=None)
+
+    def measure(self, path: Path, unexplained: float = 0.0) -> Verdict:
+        """Compare the shapes that a path gives with those of the free cameras, and accept it."""
+        tiny = np.finfo(float).tiny
+        problem = self._solve(path.turn.every(self.step).rotations)
+        motion = max(problem.motion(), tiny)
+        gain = max(0.0, math.log(max(problem.image_motion(), tiny) / motion))
+        rise = math.log(motion / max(self._free.motion(), tiny))
+        nuclear = float(problem.spectrum().sum())
+        return Verdict(
+            unexplained,
+            f"leaves {unexplained:.1%} of the rotation unexplained and changes the motion of the "
+            f"object by {math.expm1(rise):+.0%}",
+            rise,
+            _MOTION_WEIGHT * gain * nuclear / motion,
+            float(self._free.spectrum().sum()) / max(nuclear, tiny),
+        )
+
+    def _solve(self, rotations: NDArray[np.float64]) -> DepthProblem:
+        """Return the best shapes for some cameras."""
+        problem = DepthProblem(self.measurements, rotations)
+        problem.start_from_least_motion()
+        problem.minimise(120, 1e-4)
+        return problem
