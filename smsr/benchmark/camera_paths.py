@@ -119,6 +119,34 @@ def jitter(t: Array, rng: np.random.Generator) -> Array:
     return sway(*(2.0 * rng.standard_normal((3, len(t))))) @ turn(3.0 * t)
 
 
+def ease(t: Array) -> Array:
+    """Return parts of the way, at frames t, of a motion that starts and ends at rest."""
+    x = t / len(t)
+    return np.asarray(x * x * (3.0 - 2.0 * x))
+
+
+def pendulum(t: Array, _: np.random.Generator) -> Array:
+    """Swing twice about one axis."""
+    return turn(40.0 * np.sin(4.0 * np.pi * t / len(t)))
+
+
+def swing(t: Array, _: np.random.Generator) -> Array:
+    """Swing widely, and less than once."""
+    return turn(60.0 * np.sin(1.5 * np.pi * t / len(t) + 0.4))
+
+
+def drone(t: Array, _: np.random.Generator) -> Array:
+    """Turn steadily, rising and sinking once."""
+    return sway(15.0 * np.sin(2.0 * np.pi * t / len(t))) @ turn(2.0 * t)
+
+
+def smooth(t: Array, rng: np.random.Generator) -> Array:
+    """Turn about all axes by random cosines."""
+    cosines = np.cos(np.pi * np.arange(1, 7)[:, None] * (t + 0.5) / len(t))
+    sizes = 30.0 / np.arange(1, 7) * rng.standard_normal((3, 6))
+    return sway(*(sizes @ cosines))
+
+
 PATHS: Final[Mapping[str, Callable[[Array, np.random.Generator], Array]]] = {
     "slow": lambda t, _: turn(1.0 * t),
     "fast": lambda t, _: turn(5.0 * t),
@@ -132,6 +160,14 @@ PATHS: Final[Mapping[str, Callable[[Array, np.random.Generator], Array]]] = {
     "two turns": two_turns,
     "handheld": handheld,
     "tripod": lambda t, _: turn(0.0 * t),
+    "eased": lambda t, _: turn(3.0 * len(t) * ease(t)),
+    "decelerate": lambda t, _: turn(2.0 * len(t) * (1.0 - (1.0 - t / len(t)) ** 2)),
+    "pendulum": pendulum,
+    "swing": swing,
+    "slow pan": lambda t, _: turn(60.0 * ease(t)),
+    "drone": drone,
+    "spiral": lambda t, _: sway(20.0 * t / len(t)) @ turn(3.0 * t),
+    "smooth": smooth,
 }
 """Cameras (T, 3, 3) by frame number and random generator; the units are degrees a frame."""
 

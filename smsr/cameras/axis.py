@@ -48,6 +48,12 @@ class AxisFit:
     angles: NDArray[np.float64]
     tilt: NDArray[np.float64]
 
+    @property
+    def rotations(self) -> NDArray[np.float64]:
+        """The turn's cameras (T, 3, 3)."""
+        turned: NDArray[np.float64] = so3.exp(self.angles[:, None] * self.axis) @ self.start
+        return turned
+
     def turn(self, angles: NDArray[np.float64] | None = None) -> Turn:
         """Return the turn, or one by other angles (T,) about the same axis."""
         angles = self.angles if angles is None else angles
@@ -61,15 +67,19 @@ class AxisFit:
         What the object does by itself lies along few directions as the object sees them, what the
         camera does, as the camera sees them.
         """
-        tilt = gaussian_filter1d(self.tilt, _SMOOTHING, axis=0)
+        tilt = smooth_tilt(self.tilt)
         mean_square, turned_square = float((tilt**2).sum(axis=1).mean()), float(self.angles.var())
         if turned_square < _LEAST_TURN**2 or mean_square > _MOST_TILT**2 * turned_square:
             return False
         if mean_square < _NOTABLE_TILT**2:
             return True
-        turned = so3.exp(self.angles[:, None] * self.axis) @ self.start
-        of_object = np.einsum("tji,tj->ti", turned, tilt)
+        of_object = np.einsum("tji,tj->ti", self.rotations, tilt)
         return _anisotropy(tilt) < _anisotropy(of_object - of_object.mean(axis=0))
+
+
+def smooth_tilt(tilt: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a tilt (T, 3) without the shake from frame to frame."""
+    return np.asarray(gaussian_filter1d(tilt, _SMOOTHING, axis=0))
 
 
 def _anisotropy(vectors: NDArray[np.float64]) -> float:

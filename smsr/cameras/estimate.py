@@ -25,7 +25,7 @@ class CameraEstimate:
         Cameras completed by the viewing direction.
     model : str
         How they were found: 'relaxed', 'uniform', 'switched', 'accelerated', 'eased', 'swinging',
-        'axis', 'rigid' or 'paper'.
+        'axis', 'gimbal', 'rigid' or 'paper'.
     basis_size : int
         K, the number of column triplets of the corrective matrix.
     iterations : int

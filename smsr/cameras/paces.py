@@ -45,14 +45,14 @@ def fit_paces(angles: NDArray[np.float64]) -> list[Pace]:
     """Fit a changing velocity, an easing in and out, and swings to angles (T,)."""
     time = np.linspace(-1.0, 1.0, len(angles), dtype=np.float64)
     return [
-        Pace("accelerated", robust_fit(_polynomials(time, 2), angles), 1),
-        Pace("eased", robust_fit(_polynomials(time, 3), angles), 2),
+        Pace("accelerated", robust_fit(polynomials(time, 2), angles), 1),
+        Pace("eased", robust_fit(polynomials(time, 3), angles), 2),
         Pace("swinging", fit_swing(time, angles, 0), 2),
         Pace("swinging", fit_swing(time, angles, 1), 3),
     ]
 
 
-def _polynomials(time: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+def polynomials(time: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
     """Return the Legendre polynomials (T, degree + 1) at times within -1 and 1."""
     return np.asarray(legvander(time, degree), np.float64)
 
@@ -78,7 +78,7 @@ def fit_swing(
 
     def basis(time: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
         phase = np.pi * cycles * time
-        return np.column_stack([_polynomials(time, degree), np.sin(phase), np.cos(phase)])
+        return np.column_stack([polynomials(time, degree), np.sin(phase), np.cos(phase)])
 
     step = -(-len(angles) // _FRAMES)
     some_time, some = time[::step], angles[::step]

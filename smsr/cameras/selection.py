@@ -49,7 +49,6 @@ free cameras does."""
 FEWEST_FRAMES = 12
 """Paths are fitted to at least so many frames."""
 
-_CERTAIN = ("uniform", "switched")
 _FRAMES = 400
 _DIRECTIONS = 24
 _SPAN_DIRECTIONS = 18
@@ -187,15 +186,15 @@ def with_simple_path(
     refusals = []
     for path in trial.paths():
         verdict = trial.judge(path)
-        criteria[f"{path.name}_unexplained"] = verdict.unexplained
+        criteria[f"{path.model}_unexplained"] = verdict.unexplained
         if verdict.motion_rise is not None:
-            criteria[f"{path.name}_motion_rise"] = verdict.motion_rise
+            criteria[f"{path.model}_motion_rise"] = verdict.motion_rise
         if verdict.motion_weight is None:
             refusals.append(f"{path} {verdict.reason}")
             continue
-        turn = _refined(path, verdict, trial, hook)
+        turn = path.turn if path.is_loose else _refined(path, verdict, trial, hook)
         outside = part_outside_span(measurements, turn.rotations)
-        criteria[f"{path.name}_outside_span"] = outside
+        criteria[f"{path.model}_outside_span"] = outside
         if outside > limit and not denoised:
             refusals.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
             continue
@@ -216,7 +215,7 @@ def _refined(path: Path, verdict: Verdict, trial: Trial, hook: StageHook) -> Tur
         hook=hook,
     )
     velocity = some.velocity
-    if path.name not in _CERTAIN:
+    if not path.is_certain:
         speed = float(np.linalg.norm(path.turn.velocity))
         velocity = velocity * (speed / max(float(np.linalg.norm(velocity)), np.finfo(float).tiny))
     return dataclasses.replace(path.turn, velocity=velocity)
@@ -228,15 +227,15 @@ def _on_path(
     """Return the cameras of an accepted path."""
     low, high = SIMPLER
     share = min(max((high - verdict.simplicity) / (high - low), 0.0), 1.0)
-    certain = path.name in _CERTAIN and by_turn_speed(turn.rotations, 0.0, 1.0)
-    least = LEAST_SHARE * (1.0 - certain)
+    certain = path.is_certain and by_turn_speed(turn.rotations, 0.0, 1.0)
+    least = 1.0 if path.is_loose else LEAST_SHARE * (1.0 - certain)
     speed = math.degrees(float(np.linalg.norm(turn.velocity)))
     return dataclasses.replace(
         free,
         rotations=turn.rotations,
-        model=path.name,
+        model=path.model,
         criteria=criteria,
-        coherent=(verdict.motion_rise or 0.0) <= COHERENT_RISE,
+        coherent=not path.is_loose and (verdict.motion_rise or 0.0) <= COHERENT_RISE,
         simpler=free.rotations,
         simpler_share=max(share, least),
         reason=f"{path} of {speed:.2f} degrees a frame {verdict.reason}; {free.reason}",

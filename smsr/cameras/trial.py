@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from smsr import rotations as so3
 from smsr.cameras.axis import fit_axis
+from smsr.cameras.gimbal import fit_gimbal
 from smsr.cameras.paces import fit_paces
 from smsr.cameras.rest import resting_frame
 from smsr.cameras.switched import fit_switched_turn
@@ -58,32 +59,56 @@ class Path:
     Attributes
     ----------
     name : str
-        The camera model that it makes.
+        Of the kind of turn.
     turn : Turn
         With the shake of the cameras, where it is known.
     parameters : int
         Beyond those of a uniform turn.
     unexplained : float
         Mean squared angle, radians, by which free cameras drift from it.
+    nods : bool
+        Whether the camera nods meanwhile.
     """
 
     name: str
     turn: Turn
     parameters: int = 0
     unexplained: float = 0.0
+    nods: bool = False
 
     @property
     def score(self) -> float:
-        """An information criterion: the path of the lowest is the most likely one."""
-        return math.log(self.unexplained + FLOOR**2) + COST_OF_A_PARAMETER * self.parameters
+        """See `score`."""
+        return score(self.unexplained, self.parameters)
+
+    @property
+    def model(self) -> str:
+        """Name of the camera model that it makes."""
+        return "gimbal" if self.nods else self.name
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is so special that hardly anything else looks like it."""
+        return self.model in {"uniform", "switched"}
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether it only corrects the frame: depths are those that the free cameras see."""
+        return self.model in {"gimbal", "axis"}
 
     def __str__(self) -> str:
-        return {
+        turn = {
             "axis": "a turn about one axis",
             "accelerated": "an accelerated turn",
             "eased": "a turn that eases in or out",
             "swinging": "a swing",
         }.get(self.name, f"a {self.name} turn")
+        return f"{turn} with a nod" if self.nods else turn
+
+
+def score(unexplained: float, parameters: int) -> float:
+    """Return an information criterion: the path of the lowest is the most likely one."""
+    return math.log(unexplained + FLOOR**2) + COST_OF_A_PARAMETER * parameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +134,19 @@ class Verdict:
     motion_rise: float | None = None
     motion_weight: float | None = None
     simplicity: float = 1.0
+
+
+def _as_seen(path: Path, steady: NDArray[np.float64], nod: NDArray[np.float64] | None) -> Path:
+    """Add to a path the shake of the cameras, how far they are from it, and their nod (T, 3)."""
+    turn, drift = with_shake(path.turn, steady)
+    if nod is not None:
+        turn = dataclasses.replace(turn, shake=so3.log(so3.exp(nod) @ so3.exp(turn.shake)))
+    return dataclasses.replace(
+        path,
+        turn=turn,
+        unexplained=float((drift**2).sum(axis=1).mean()),
+        nods=nod is not None,
+    )
 
 
 class Trial:
@@ -158,13 +196,18 @@ class Trial:
     def paths(self) -> list[Path]:
         """Return the most likely path, and as the next one any turn about the same axis.
 
-        There is none where the cameras do not keep to an axis.
+        There is none where the cameras do not keep to an axis, nodding or not.
         """
-        axis = fit_axis(self.rotations)
+        axis, nod = fit_axis(self.rotations), None
+        steady = self.rotations
         if not axis.is_followed():
-            return []
-        found = [Path("uniform", fit_uniform_turn(self.rotations))]
-        switched = fit_switched_turn(self.rotations)
+            gimbal = fit_gimbal(self.rotations, score)
+            axis, nod = gimbal.axis, gimbal.nod
+            steady = so3.exp(-nod) @ self.rotations
+            if not axis.is_followed():
+                return []
+        found = [Path("uniform", fit_uniform_turn(steady))]
+        switched = fit_switched_turn(steady)
         if switched is not None:
             changes = int((np.abs(np.diff(switched.angles, 2)) > _SWITCH).sum())
             found.append(Path("switched", switched, 1 + changes // _SWITCHES_PER_PARAMETER))
@@ -172,15 +215,12 @@ class Trial:
             Path(pace.name, axis.turn(pace.angles), pace.parameters)
             for pace in fit_paces(axis.angles)
         ]
-        anyhow = self._with_shake(Path("axis", axis.turn(), _FREE_ANGLES))
-        best = min([self._with_shake(path) for path in found], key=lambda path: path.score)
-        return [best, anyhow] if best.score < anyhow.score else [anyhow]
-
-    def _with_shake(self, path: Path) -> Path:
-        turn, drift = with_shake(path.turn, self.rotations)
-        return dataclasses.replace(
-            path, turn=turn, unexplained=float((drift**2).sum(axis=1).mean())
+        *found, anyhow = (
+            _as_seen(path, steady, nod)
+            for path in [*found, Path("axis", axis.turn(), _FREE_ANGLES)]
         )
+        best = min(found, key=lambda path: path.score)
+        return [best, anyhow] if best.score < anyhow.score else [anyhow]
 
     def judge(self, path: Path) -> Verdict:
         """Put a path to the tests."""

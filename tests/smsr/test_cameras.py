@@ -18,6 +18,7 @@ from smsr.cameras.constraints import (
 from smsr.cameras.estimate import CameraEstimate, scaled_motion, usable_rank
 from smsr.cameras.free import angle_between, complexity, free_cameras
 from smsr.cameras.gauge import fix_gauge
+from smsr.cameras.gimbal import fit_gimbal
 from smsr.cameras.paces import fit_paces
 from smsr.cameras.paper import published_cameras, thresholded_factor
 from smsr.cameras.relaxed import relaxed_cameras, relaxed_factor
@@ -25,6 +26,7 @@ from smsr.cameras.rest import resting_frame
 from smsr.cameras.rigid import rigid_cameras
 from smsr.cameras.selection import part_outside_span, with_simple_path, with_uniform_path
 from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
+from smsr.cameras.trial import score
 from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
 
@@ -384,6 +386,17 @@ def easing(frames: int) -> Array:
     return about_one_axis(6.0 * (time - 0.8) ** 3 - 2.0 * time)
 
 
+def tumbling(frames: int) -> Array:
+    time = np.linspace(0.0, 1.0, frames)
+    angles = [0.7 * np.sin(9 * time), 0.8 * np.sin(14 * time + 1.0), 0.6 * np.cos(11 * time)]
+    return np.asarray(Rotation.from_euler("yxz", np.stack(angles, axis=1)).as_matrix())
+
+
+def nodding(frames: int) -> Array:
+    time = np.linspace(0.0, 1.0, frames)
+    return so3.exp(0.3 * np.sin(7.0 * time)[:, None] * np.eye(3)[:1]) @ about_one_axis(4.0 * time)
+
+
 def pendulum(frames: int) -> Array:
     return about_one_axis(0.9 * np.sin(np.linspace(0.5, 13.0, frames)))
 
@@ -415,6 +428,26 @@ class TestAxis:
     def test_what_hardly_turns_or_turns_anyhow_follows_no_axis(self) -> None:
         assert not fit_axis(about_one_axis(np.radians(np.linspace(0.0, 10.0, 50)))).is_followed()
         assert not fit_axis(swing(80)).is_followed()
+
+
+class TestGimbal:
+    @pytest.mark.parametrize(
+        "nod",
+        [lambda t: 0.6 * t, lambda t: 0.3 * np.sin(8.0 * t), lambda t: 0.3 * np.sin(6.0 * t) + t],
+    )
+    def test_a_turn_with_a_nod_is_taken_apart(self, nod: Callable[[Array], Array]) -> None:
+        time = np.linspace(0.0, 1.0, 150)
+        across = nod(time)[:, None] * np.array([1.0, 0.0, 0.0])
+        true = so3.exp(across) @ about_one_axis(5.0 * time)
+        fit = fit_gimbal(true, score)
+        assert fit.axis.is_followed()
+        assert np.linalg.norm(fit.axis.tilt, axis=1).max() < 0.015
+        found = so3.exp(fit.nod) @ fit.axis.rotations
+        assert so3.angles_between(found, true).max() < 0.015
+
+    def test_what_does_not_nod_is_not_made_to(self) -> None:
+        true = about_one_axis(np.linspace(0.0, 5.0, 100))
+        assert np.linalg.norm(fit_gimbal(true, score).nod, axis=1).max() < 1e-6
 
 
 class TestPaces:
@@ -483,6 +516,7 @@ class TestSelection:
             (accelerating, "accelerated"),
             (easing, "eased"),
             (pendulum, "swinging"),
+            (nodding, "gimbal"),
         ],
     )
     def test_a_simple_path_is_recognised(self, path: Callable[[int], Array], model: str) -> None:
@@ -500,17 +534,14 @@ class TestSelection:
     @pytest.mark.parametrize("amplitude", [0.1, 0.3])
     @pytest.mark.parametrize("seed", [0, 1])
     def test_another_motion_is_left_alone(self, amplitude: float, seed: int) -> None:
-        wobble = np.radians(14 * np.sin(np.arange(80) / 6.0))
-        pitch = Rotation.from_rotvec(wobble[:, None] * np.array([1.0, 0.0, 0.0])).as_matrix()
-        for true in (swing(80), pitch @ orbit(80)):
-            left, values = low_rank(true, modes=2, amplitude=amplitude, seed=seed)
-            free = relaxed_cameras(left, values)
-            estimate = with_simple_path(free, left * values)
-            assert estimate.model == "relaxed"
-            np.testing.assert_array_equal(estimate.rotations, free.rotations)
+        left, values = low_rank(tumbling(80), modes=2, amplitude=amplitude, seed=seed)
+        free = relaxed_cameras(left, values)
+        estimate = with_simple_path(free, left * values)
+        assert estimate.model == "relaxed"
+        np.testing.assert_array_equal(estimate.rotations, free.rotations)
 
     def test_points_at_rest_take_the_drift_of_free_cameras_away(self) -> None:
-        true = swing(80)
+        true = tumbling(80)
         shapes = TestRest.drifting(resting=15)[0][:1] + np.zeros((80, 1, 1))
         shapes[:, :, 15:] += 0.5 * np.sin(np.linspace(0.0, 9.0, 80))[:, None, None]
         shapes -= shapes.mean(axis=2, keepdims=True)

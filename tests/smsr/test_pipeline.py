@@ -43,7 +43,7 @@ def orbit(frames: int = 40, points: int = 25, seed: int = 0) -> smsr.synthetic.E
     return dataclasses.replace(example, measurements=W, cameras=cameras)
 
 
-SEQUENCES = {"orbit": orbit(), "free": make_low_rank(40, 25, 1, seed=1)}
+SEQUENCES = {"orbit": orbit(), "nodding": make_low_rank(40, 25, 1, seed=1)}
 
 
 @pytest.fixture(params=SEQUENCES)
@@ -84,7 +84,7 @@ class TestResult:
             name: reconstruct(example.measurements).diagnostics.camera_model
             for name, example in SEQUENCES.items()
         }
-        assert models == {"orbit": "uniform", "free": "relaxed"}
+        assert models == {"orbit": "uniform", "nodding": "gimbal"}
 
     def test_measurements_are_reproduced(self, example: smsr.synthetic.Example) -> None:
         assert_valid(reconstruct(example.measurements), example.measurements)
@@ -111,7 +111,7 @@ class TestResult:
 
     @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int32])
     def test_single_precision_stays_single(self, dtype: type) -> None:
-        W: NDArray[Any] = (1000 * SEQUENCES["free"].measurements).astype(dtype)
+        W: NDArray[Any] = (1000 * SEQUENCES["nodding"].measurements).astype(dtype)
         result = reconstruct(W)
         assert result.shapes.dtype == (np.float32 if dtype is np.float32 else np.float64)
         assert result.cameras.dtype == result.translations.dtype == np.float64
@@ -123,7 +123,7 @@ class TestResult:
         np.testing.assert_array_equal(first.cameras, second.cameras)
 
     def test_input_is_not_changed_and_threads_are_given_back(self) -> None:
-        W = SEQUENCES["free"].measurements.copy()
+        W = SEQUENCES["nodding"].measurements.copy()
         before = W.copy(), threadpool_info()
         reconstruct(W)
         np.testing.assert_array_equal(W, before[0])
@@ -187,7 +187,7 @@ class TestInvariance:
         )
 
     def test_one_frame_translation_does_not_move_any_shape(self) -> None:
-        W = SEQUENCES["free"].measurements
+        W = SEQUENCES["nodding"].measurements
         far = W.copy()
         far[10:12] += 1e4
         np.testing.assert_allclose(reconstruct(far).shapes, reconstruct(W).shapes, atol=1e-6)
@@ -256,19 +256,19 @@ class TestProgress:
         def answer(_: Progress) -> object:
             return value
 
-        reconstruct(SEQUENCES["free"].measurements[:12], progress=answer)
+        reconstruct(SEQUENCES["nodding"].measurements[:12], progress=answer)
 
     def test_errors_of_the_callback_pass_through(self) -> None:
         def fail(_: Progress) -> None:
             raise LookupError("disk")
 
         with pytest.raises(LookupError, match="disk"):
-            reconstruct(SEQUENCES["free"].measurements, progress=fail)
+            reconstruct(SEQUENCES["nodding"].measurements, progress=fail)
 
 
 class TestOptions:
     def test_values_override_the_object(self) -> None:
-        W = SEQUENCES["free"].measurements
+        W = SEQUENCES["nodding"].measurements
         result = reconstruct(W, options=Options(camera_model="relaxed"), shape_iterations=7)
         assert result.diagnostics.options.camera_model == "relaxed"
         assert result.diagnostics.options.shape_iterations == 7
@@ -279,7 +279,7 @@ class TestOptions:
         assert [c.code for c in result.diagnostics.cautions] == ["not-converged"]
 
     def test_mistakes_are_refused_before_any_work(self) -> None:
-        W = SEQUENCES["free"].measurements
+        W = SEQUENCES["nodding"].measurements
         with pytest.raises(UnknownOption, match="virtual_points"):
             reconstruct(W, virtual_point=3)
         with pytest.raises(InvalidOption, match="between"):
@@ -335,7 +335,7 @@ def rigid(frames: int, points: int, degrees: float, flat: bool = False) -> Array
 def degenerate() -> dict[str, Array]:
     """Return inputs with little to go by."""
     rng = np.random.default_rng(1)
-    plain = SEQUENCES["free"].measurements
+    plain = SEQUENCES["nodding"].measurements
     collapsed = plain.copy()
     collapsed[20:22] = 1.0
     no_v = plain.copy()
@@ -407,5 +407,5 @@ class TestDegenerateInput:
         assert result.diagnostics.basis_size == 1
 
     def test_low_rank_measurements_smaller_than_the_basis(self) -> None:
-        W = SEQUENCES["free"].measurements
+        W = SEQUENCES["nodding"].measurements
         assert_valid(reconstruct(W, basis_size=30), W)
