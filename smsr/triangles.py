@@ -55,7 +55,8 @@ class Triangle:
 
 def every_nth(points: slice, step: int) -> slice:
     """Return where in a block of points those stand whose number is a multiple of `step`."""
-    return slice(-points.start % step, points.stop - points.start, step)
+    count = points.stop - points.start
+    return slice(min(-points.start % step, count), count, step)
 
 
 def triangle_of(

@@ -67,6 +67,7 @@ class TestDaskSource:
         np.testing.assert_allclose(space.means, expected.means, rtol=1e-13)
         scale = expected.singular_values[0]
         np.testing.assert_allclose(space.factor, expected.factor, atol=1e-10 * scale)
+        np.testing.assert_allclose(space.sample, expected.sample, atol=1e-12 * scale)
         S = map_back(here, expected, A)
         np.testing.assert_allclose(
             map_back(source, space, A, chunk_bytes=SIZE), S, atol=1e-12 * np.abs(S).max()

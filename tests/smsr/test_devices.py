@@ -90,6 +90,7 @@ def test_the_passes_agree_with_those_of_numpy(place: Place, dtype: str, tmp_path
     np.testing.assert_allclose(space.means, expected.means, rtol=1e-13)
     scale = expected.singular_values[0]
     np.testing.assert_allclose(space.factor, expected.factor, atol=1e-10 * scale)
+    np.testing.assert_allclose(space.sample, expected.sample, atol=1e-12 * scale)
     S = map_back(as_source(W), expected, A)
     shapes = map_back(source, space, A, chunk_bytes=SIZE)
     assert type(shapes) is np.ndarray

@@ -68,6 +68,7 @@ def test_every_nth_point_is_kept_however_blocks_are_cut(cuts: tuple[int, ...], s
     ]
     np.testing.assert_array_equal(merged(parts).sample, X[:, ::step] - shift[:, None])
     assert every_nth(slice(10, 20), 8) == slice(6, 10, 8)
+    assert every_nth(slice(10, 12), 8) == slice(2, 2, 8)
 
 
 @pytest.mark.parametrize("count", [5, 12, 13, 767, 768, 50_000])
