@@ -41,7 +41,10 @@ def convert(
     ] = False,
     every: Annotated[int, typer.Option(min=1, help="Take every n-th frame.")] = 1,
     image_v: Annotated[
-        ImageV, typer.Option(help="Where the second image coordinate grows to; down for pixels.")
+        ImageV,
+        typer.Option(
+            help="Where the second image coordinate grows to: down for pixels; auto: by its signs."
+        ),
     ] = DEFAULTS.image_v,
 ) -> None:
     """Write a result as one animated GLB, for Blender and viewers.
@@ -53,9 +56,8 @@ def convert(
     target = out or source.with_suffix(".glb")
     found = open_result(source)
     faces = _faces_of(source, found.shapes.shape[1])
-    write_glb(
-        target, found.shapes, found.cameras, faces, GlbOptions(fps, quantised, every, image_v)
-    )
+    options = GlbOptions(fps, quantised, every, image_v)
+    write_glb(target, found.shapes, found.cameras, faces, options, found.translations)
     console.print(f"Wrote {target} ({target.stat().st_size / 2**20:.1f} MiB)", soft_wrap=True)
 
 
@@ -71,7 +73,10 @@ def plot(
     ] = None,
     form: Annotated[FigureFormat, typer.Option("--format", help="Kind of picture.")] = "png",
     image_v: Annotated[
-        ImageV, typer.Option(help="Where the second image coordinate grows to; down for pixels.")
+        ImageV,
+        typer.Option(
+            help="Where the second image coordinate grows to: down for pixels; auto: by its signs."
+        ),
     ] = DEFAULTS.image_v,
 ) -> None:
     """Draw a result: convergence, singular values, error, shapes and cameras.
