@@ -15,6 +15,7 @@ export interface Job {
   id: string;
   status: Status;
   name: string | null;
+  batch: string | null;
   created_at: string;
   started_at: string | null;
   finished_at: string | null;
@@ -38,6 +39,27 @@ export interface Job {
   } | null;
   problem: Problem | null;
   links: Record<string, string | null | undefined>;
+}
+
+/** How some numbers lie. */
+export interface Spread {
+  count: number;
+  mean: number;
+  median: number;
+  min: number;
+  max: number;
+}
+
+/** Jobs that share a label; the lower members are missing in a list. */
+export interface Batch {
+  label: string;
+  total: number;
+  jobs: Record<Status, number>;
+  created_at: string;
+  links: Record<"self" | "jobs" | "cancel" | "retry" | "results", string | null>;
+  progress?: number;
+  e3d?: Spread | null;
+  timings?: { elapsed: number | null; run_total: number; run: Spread | null };
 }
 
 export interface Metrics {
@@ -95,6 +117,18 @@ export const key = {
 /** Called when the service wants a key, or another one. */
 export const onKeyWanted = new Set<() => void>();
 
+/** Whether the service answers, as the last request found. */
+export const connection = {
+  lost: false,
+  /** Called when it is lost, and when it is there again. */
+  onchange: new Set<() => void>(),
+  set(lost: boolean): void {
+    if (lost === this.lost) return;
+    this.lost = lost;
+    for (const changed of this.onchange) changed();
+  },
+};
+
 function authorised(headers: HeadersInit = {}): Headers {
   const all = new Headers(headers);
   const known = key.get();
@@ -109,8 +143,10 @@ export async function ask(path: string, init: RequestInit = {}): Promise<Respons
     answer = await fetch(address(path), { ...init, headers: authorised(init.headers) });
   } catch (error) {
     if ((error as Error).name === "AbortError") throw error;
+    connection.set(true);
     throw new Unreachable();
   }
+  connection.set(false);
   if (answer.ok || answer.status === 304) return answer;
   throw refusal(answer.status, await answer.text());
 }
@@ -146,8 +182,14 @@ export const getJob = (id: string, signal?: AbortSignal): Promise<Job> =>
 export const listJobs = (path: string, signal?: AbortSignal) =>
   json<{ jobs: Job[]; next: string | null }>(path, { signal });
 
-export const post = (path: string): Promise<Job> => json<Job>(path, { method: "POST" });
-export const remove = (job: Job): Promise<Response> => ask(job.links.self!, { method: "DELETE" });
+export const getBatch = (label: string, signal?: AbortSignal): Promise<Batch> =>
+  json<Batch>(`v1/batches/${encodeURIComponent(label)}`, { signal });
+
+export const listBatches = (signal?: AbortSignal) =>
+  json<{ batches: Batch[]; next: string | null }>("v1/batches?limit=20", { signal });
+
+export const post = <T>(path: string): Promise<T> => json<T>(path, { method: "POST" });
+export const remove = (path: string): Promise<Response> => ask(path, { method: "DELETE" });
 
 /** What the documentation of a problem's type advises. */
 export async function remedyOf(problem: Problem): Promise<string | null> {
@@ -169,11 +211,13 @@ export async function remedyOf(problem: Problem): Promise<string | null> {
 export function submit(
   files: Partial<Record<string, File>>,
   options: Record<string, unknown>,
+  settings: Record<string, string>,
   progress: (fraction: number) => void,
   signal: AbortSignal,
 ): Promise<Job> {
   const form = new FormData();
   form.set("options", JSON.stringify(options));
+  for (const [name, value] of Object.entries(settings)) form.set(name, value);
   for (const [role, file] of Object.entries(files)) if (file) form.set(role, file, file.name);
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();

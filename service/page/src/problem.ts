@@ -24,11 +24,15 @@ export function problemPanel(problem: Problem): HTMLElement {
       ),
     );
     void remedyOf(problem).then((text) => {
-      if (text) append(remedy, h("strong", {}, "What helps: "), text);
+      if (text) append(remedy, h("strong", {}, "What helps: "), marked(text));
     });
   }
   return panel;
 }
+
+/** Names between backticks, as code. */
+const marked = (text: string): (string | HTMLElement)[] =>
+  text.split("`").map((part, i) => (i % 2 ? h("code", {}, part) : part));
 
 /** The panel of anything that was thrown. */
 export function errorPanel(error: unknown): HTMLElement {
