@@ -283,7 +283,7 @@ export class Scene {
     if (!this.moved) this.resetView();
     this.ranges.depth = this.rangeOf((k, i, X) => {
       const R = this.rotations[k];
-      return -this.upward * (R[6] * X[i] + R[7] * X[i + 1] + R[8] * X[i + 2]);
+      return this.upward * (R[6] * X[i] + R[7] * X[i + 1] + R[8] * X[i + 2]);
     });
     const motion = this.rangeOf(
       (k, i, X) =>
@@ -431,7 +431,7 @@ export class Scene {
     uniforms.mode.value = MODES[colouring];
     uniforms.range.value.set(...this.ranges[colouring]);
     const R = this.rotations[low];
-    if (R) uniforms.depthAxis.value.set(R[6], R[7], R[8]).multiplyScalar(-this.upward);
+    if (R) uniforms.depthAxis.value.set(R[6], R[7], R[8]).multiplyScalar(this.upward);
     uniforms.pointSize.value = this.look.pointSize * this.renderer.getPixelRatio();
     uniforms.radius.value = this.radius;
   }

@@ -20,7 +20,7 @@ const COLOURINGS: Record<Colouring, string> = {
   plain: "One colour",
 };
 const LEGENDS: Record<Colouring, string> = {
-  depth: "Depth as the camera looks, in the unit of the tracks",
+  depth: "Depth, towards the camera, in the unit of the tracks",
   motion: "3D motion in a frame, in the unit of the tracks",
   error: "Distance from the ground truth, in σ (as e3D)",
   plain: "",
