@@ -26,12 +26,13 @@ class SubmitView {
   readonly element: HTMLElement;
   private chosen: Chosen[] = [];
   private form: OptionForm | null = null;
+  /** Bytes that the service takes at once. */
+  private most = Infinity;
   private readonly input = h("input", {
     type: "file",
     multiple: true,
     id: "files",
     class: "only-heard",
-    accept: ".npy,.npz,.mat,.csv,.txt,.gz",
   });
   private readonly drop: HTMLElement;
   private readonly list = h("ul", { class: "files", "aria-label": "Chosen files" });
@@ -98,12 +99,15 @@ class SubmitView {
     try {
       const known = await info();
       this.problems.replaceChildren();
+      this.most = known.limits.upload_bytes;
+      this.input.accept = known.formats.measurements.map((name) => `.${name}`).join(",");
       this.form = optionForm(known.options);
       this.form.onchange = (name) => {
         if (name === "layout") this.showPreview();
         if (name === "missing") this.warn();
       };
       replace(this.optionArea, h("h2", {}, "Options"), this.form.element);
+      if (this.chosen.length) this.update();
     } catch (error) {
       replace(this.problems, errorPanel(error));
     }
@@ -249,14 +253,17 @@ class SubmitView {
     if (number("measurements") > 1 && number("ground_truth")) {
       return "With ground truth, send one file of measurements at a time.";
     }
+    const rest = sizeOf(this.chosen.filter((c) => c.role && c.role !== "measurements"));
+    if (this.measured().some((c) => rest + c.file.size > this.most)) {
+      return `That is more than the service takes at once (${bytes(this.most)}).`;
+    }
     return null;
   }
 
   private summary(): string {
     const sent = this.chosen.filter((c) => c.role);
-    const size = sent.reduce((sum, c) => sum + c.file.size, 0);
     const jobs = this.measured().length;
-    const files = `${sent.length === 1 ? "1 file" : `${sent.length} files`}, ${bytes(size)}`;
+    const files = `${sent.length === 1 ? "1 file" : `${sent.length} files`}, ${bytes(sizeOf(sent))}`;
     return jobs > 1 ? `${files}: ${jobs} jobs` : files;
   }
 
@@ -410,6 +417,8 @@ class SubmitView {
     }
   }
 }
+
+const sizeOf = (files: Chosen[]): number => files.reduce((sum, c) => sum + c.file.size, 0);
 
 function described({ file, inspected, role }: Chosen): string {
   const parts = [bytes(file.size)];
