@@ -232,7 +232,10 @@ export function submit(
       if (request.status >= 200 && request.status < 300) resolve(JSON.parse(request.responseText));
       else reject(refusal(request.status, request.responseText));
     });
-    request.addEventListener("error", () => reject(new Unreachable()));
+    request.addEventListener("error", () => {
+      connection.set(true);
+      reject(new Unreachable());
+    });
     request.addEventListener("abort", () => reject(new DOMException("stopped", "AbortError")));
     signal.addEventListener("abort", () => request.abort());
     request.send(form);

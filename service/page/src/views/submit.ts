@@ -74,8 +74,7 @@ class SubmitView {
       this.optionArea,
       this.settings,
       this.problems,
-      h("div", { class: "send-row" }, this.send, this.hint),
-      this.sending,
+      h("div", { class: "send-row" }, this.send, this.hint, this.sending),
     );
     this.element.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -381,6 +380,7 @@ class SubmitView {
     const cancel = h("button", { type: "button", onclick: () => stop.abort() }, "Stop");
     replace(this.sending, bar, text, cancel);
     this.sending.hidden = false;
+    this.hint.hidden = true;
     this.send.disabled = true;
     this.problems.replaceChildren();
     say("Sending");
@@ -405,14 +405,19 @@ class SubmitView {
         // What is sent is not sent again where a later file is refused.
         if (measured.length > 1) this.chosen = this.chosen.filter((other) => other !== chosen);
       }
+      if (this.signal.aborted) return say("Sent"); // who left meanwhile is not fetched back
       if (measured.length === 1) location.hash = `#/jobs/${last!.id}`;
       else location.hash = settings.batch ? `#/batches/${settings.batch}` : "#/jobs";
     } catch (error) {
       this.update();
       if ((error as Error).name === "AbortError") say("The upload was stopped");
-      else replace(this.problems, errorPanel(error));
+      else {
+        replace(this.problems, errorPanel(error));
+        this.problems.scrollIntoView({ block: "nearest" });
+      }
     } finally {
       this.sending.hidden = true;
+      this.hint.hidden = false;
       this.send.disabled = this.obstacle() !== null;
     }
   }
