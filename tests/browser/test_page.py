@@ -625,6 +625,12 @@ def test_no_serious_finding_of_axe(
         page.reload()
         page.wait_for_selector("tbody tr")
         look("jobs")
+        with site.client() as client:
+            sent = {"measurements": ("tracks.npy", files["tracks.npy"])}
+            finished(client, client.post("/v1/jobs", files=sent, data={"batch": "axe"}))
+        visit.open("/#/batches/axe")
+        page.wait_for_selector(".batch progress")
+        look("batch")
         viewer_of(visit, job)
         page.get_by_text("Keyboard", exact=True).click()
         page.get_by_text("Figures", exact=True).click()

@@ -98,7 +98,7 @@ export class Refused extends Error {
 }
 
 /** No answer came. */
-export class Unreachable extends Error {
+class Unreachable extends Error {
   constructor() {
     super("The service does not answer. It may be restarting, or the connection is down.");
   }

@@ -5,8 +5,8 @@ import { HEADER_BYTES, isNpy, type NumberArray, parseHeader, readNpy, Unreadable
 import { readTable } from "./text";
 
 /** Larger files are sent without a look inside: a page must not take a gigabyte of memory. */
-export const LARGEST_NPY = 512e6;
-export const LARGEST_TEXT = 64e6;
+const LARGEST_NPY = 512e6;
+const LARGEST_TEXT = 64e6;
 
 /** A file that was looked at. */
 export interface Inspected {

@@ -65,7 +65,7 @@ export function growsUp({ positions, points }: Tracks): boolean {
   return false;
 }
 
-export function boundsOf(positions: Float32Array): Tracks["bounds"] {
+function boundsOf(positions: Float32Array): Tracks["bounds"] {
   const bounds = { left: Infinity, right: -Infinity, top: Infinity, bottom: -Infinity };
   for (let i = 0; i < positions.length; i += 2) {
     const u = positions[i];

@@ -591,7 +591,7 @@ const distance = (X: Float32Array, Y: Float32Array, i: number): number =>
   Math.hypot(X[i] - Y[i], X[i + 1] - Y[i + 1], X[i + 2] - Y[i + 2]);
 
 /** Area-weighted normals of the points as (K, 4) signed bytes; the fourth is padding. */
-export function normalsOf(positions: Float32Array, faces: Uint32Array): Int8Array {
+function normalsOf(positions: Float32Array, faces: Uint32Array): Int8Array {
   const sums = new Float32Array(positions.length);
   for (let f = 0; f < faces.length; f += 3) {
     const [a, b, c] = [3 * faces[f], 3 * faces[f + 1], 3 * faces[f + 2]];

@@ -1,6 +1,15 @@
 /** One batch: how far its jobs are, what can be done with all of them, and their list. */
 
-import { type Batch, getBatch, post, Refused, remove, save, type Status } from "../api";
+import {
+  type Batch,
+  getBatch,
+  post,
+  Refused,
+  remove,
+  save,
+  type Spread,
+  type Status,
+} from "../api";
 import { h, icon, replace } from "../dom";
 import { count, precise, seconds } from "../format";
 import { errorPanel } from "../problem";
@@ -73,10 +82,8 @@ function counts({ total, jobs }: Batch): string {
   return `${count(total)}: ${parts.join(", ")}`;
 }
 
-const spread = (
-  { median, min, max }: { median: number; min: number; max: number },
-  format: (value: number) => string,
-): string => `${format(median)} (median), ${format(min)} to ${format(max)}`;
+const spread = ({ median, min, max }: Spread, format: (value: number) => string): string =>
+  `${format(median)} (median), ${format(min)} to ${format(max)}`;
 
 function actions(
   { label, links, jobs }: Batch,
