@@ -16,7 +16,7 @@ import pytest
 from playwright.sync_api import expect
 
 from smsr.synthetic import make_example
-from tests.browser.conftest import PATIENCE, visiting
+from tests.browser.conftest import FLAGS, PATIENCE, find_chromium, visiting
 from tests.conftest import ROOT, redis_running
 from tests.service.conftest import api_running, finished, npy, settings_for
 from worker.keys import KeyStore
@@ -537,6 +537,46 @@ def test_the_list_follows_jobs_and_deletes_them(
         page.get_by_role("dialog").get_by_role("button", name="Delete").click()
         expect(row).to_have_count(0)
         assert client.get(sent.headers["Location"]).status_code == 404
+
+
+def test_a_job_is_cancelled_and_run_again(visit: Visit, site: Api, files: dict[str, bytes]) -> None:
+    endless = {
+        "camera_model": "relaxed",
+        "shape_method": "nuclear",
+        "shape_iterations": 100_000,
+        "shape_tolerance": 1e-15,
+    }
+    sent = {"measurements": ("endless.npy", files["tracks.npy"])}
+    with site.client() as client:
+        job = client.post("/v1/jobs", files=sent, data={"options": json.dumps(endless)}).json()
+    page = visit.open(f"/#/jobs/{job['id']}")
+    expect(page.locator(".badge")).to_contain_text("Running")
+    expect(page.locator(".percent")).to_contain_text("%")
+    for again in (True, False):
+        page.get_by_role("button", name="Cancel").click()
+        expect(page.locator(".notice")).to_contain_text("was cancelled")
+        if again:
+            page.get_by_role("button", name="Run again").click()
+            expect(page.locator(".facts")).to_contain_text("attempt 2")
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.get_by_role("heading", name="Jobs", exact=True)).to_be_visible()
+    visit.refusals_expected = True
+    visit.open(f"/#/jobs/{job['id']}")
+    expect(page.get_by_role("heading", name="No such job")).to_be_visible()
+
+
+def test_without_3d_the_rest_is_there(
+    page_built: Path, site: Api, job: dict[str, Any], browser: Browser
+) -> None:
+    assert page_built.is_dir()
+    with browser.browser_type.launch(
+        executable_path=find_chromium(), args=[*FLAGS, "--disable-3d-apis"]
+    ) as flat:
+        page = flat.new_page()
+        page.goto(f"{site.url}/#/jobs/{job['id']}")
+        expect(page.locator(".viewer")).to_contain_text("draws no 3D")
+        expect(page.locator(".downloads button")).to_have_count(5)
 
 
 def test_a_key_is_asked_for_where_one_is_needed(
