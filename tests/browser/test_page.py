@@ -422,6 +422,51 @@ def test_the_page_goes_on_when_the_service_is_back(
         page.wait_for_selector(".viewer[data-complete]")
 
 
+def test_a_large_upload_goes_on_where_it_broke(
+    browser: Browser, page_built: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    assert page_built.is_dir()
+    folder = tmp_path_factory.mktemp("large")
+    example = make_example(frames=20, side=460)
+    np.save(folder / "large.npy", example.measurements)
+    assert (folder / "large.npy").stat().st_size > 64e6
+    with contextlib.ExitStack() as stack:
+        redis = stack.enter_context(redis_running(folder))
+        settings = settings_for(folder, redis, max_upload_bytes=2**30, max_array_bytes=2**30)
+        crashing = stack.enter_context(api_running(settings, redis, folder / "api.log"))
+        visit = stack.enter_context(visiting(browser, crashing))
+        visit.refusals_expected = True
+        offsets: list[int] = []
+        visit.page.on(
+            "request",
+            lambda request: (
+                offsets.append(int(request.headers["upload-offset"]))
+                if request.method == "PATCH"
+                else None
+            ),
+        )
+        page = visit.open()
+        page.set_input_files("#files", folder / "large.npy")
+        page.context.new_cdp_session(page).send(
+            "Network.emulateNetworkConditions",
+            {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 2e7},
+        )
+        page.get_by_role("button", name="Send").click()
+        percent = page.locator(".sending span")
+        expect(percent).to_have_text(re.compile(r"^[2-9]\d %"))
+        crashing.process.kill()
+        expect(page.locator("#away")).to_be_visible()
+        port = int(crashing.url.rpartition(":")[2])
+        stack.enter_context(api_running(settings, redis, folder / "again.log", port))
+        stack.enter_context(WorkerPool(settings, 1))
+        page.wait_for_selector(".viewer[data-loaded]")
+        assert offsets[0] == 0
+        assert offsets[-1] > 5e6
+        job = httpx.get(f"{crashing.url}/v1/jobs/{page.url.rpartition('/')[2]}").json()
+        sent = httpx.get(crashing.url + job["inputs"]["measurements"]["link"]).content
+        assert sent == (folder / "large.npy").read_bytes()
+
+
 def test_a_file_that_is_none_is_refused_in_words(visit: Visit) -> None:
     visit.refusals_expected = True
     page = visit.open()

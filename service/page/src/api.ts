@@ -98,7 +98,7 @@ export class Refused extends Error {
 }
 
 /** No answer came. */
-class Unreachable extends Error {
+export class Unreachable extends Error {
   constructor() {
     super("The service does not answer. It may be restarting, or the connection is down.");
   }
@@ -129,7 +129,7 @@ export const connection = {
   },
 };
 
-function authorised(headers: HeadersInit = {}): Headers {
+export function authorised(headers: HeadersInit = {}): Headers {
   const all = new Headers(headers);
   const known = key.get();
   if (known) all.set("Authorization", `Bearer ${known}`);
@@ -151,7 +151,7 @@ export async function ask(path: string, init: RequestInit = {}): Promise<Respons
   throw refusal(answer.status, await answer.text());
 }
 
-function refusal(status: number, body: string): Refused {
+export function refusal(status: number, body: string): Refused {
   if (status === 401) for (const wanted of onKeyWanted) wanted();
   try {
     const problem = JSON.parse(body) as Problem;
@@ -163,7 +163,7 @@ function refusal(status: number, body: string): Refused {
   return new Refused({ type: "about:blank", title, status });
 }
 
-async function json<T>(path: string, init?: RequestInit): Promise<T> {
+export async function json<T>(path: string, init?: RequestInit): Promise<T> {
   return (await ask(path, init)).json() as Promise<T>;
 }
 
@@ -201,45 +201,6 @@ export async function remedyOf(problem: Problem): Promise<string | null> {
   } catch {
     return null;
   }
-}
-
-/**
- * Send a job.
- *
- * XMLHttpRequest, because fetch does not tell how much of a body has been sent.
- */
-export function submit(
-  files: Partial<Record<string, File>>,
-  options: Record<string, unknown>,
-  settings: Record<string, string>,
-  progress: (fraction: number) => void,
-  signal: AbortSignal,
-): Promise<Job> {
-  const form = new FormData();
-  form.set("options", JSON.stringify(options));
-  for (const [name, value] of Object.entries(settings)) form.set(name, value);
-  for (const [role, file] of Object.entries(files)) if (file) form.set(role, file, file.name);
-  return new Promise((resolve, reject) => {
-    const request = new XMLHttpRequest();
-    request.open("POST", address("v1/jobs"));
-    authorised().forEach((value, name) => {
-      request.setRequestHeader(name, value);
-    });
-    request.upload.addEventListener("progress", (event) => {
-      if (event.lengthComputable) progress(event.loaded / event.total);
-    });
-    request.addEventListener("load", () => {
-      if (request.status >= 200 && request.status < 300) resolve(JSON.parse(request.responseText));
-      else reject(refusal(request.status, request.responseText));
-    });
-    request.addEventListener("error", () => {
-      connection.set(true);
-      reject(new Unreachable());
-    });
-    request.addEventListener("abort", () => reject(new DOMException("stopped", "AbortError")));
-    signal.addEventListener("abort", () => request.abort());
-    request.send(form);
-  });
 }
 
 /** Save a file: by its address where that is enough, else with the key, through memory. */

@@ -1,6 +1,6 @@
 /** A new job: files, a look at them, options, and off. */
 
-import { connection, info, type Job, submit } from "../api";
+import { connection, info, type Job } from "../api";
 import { exampleFiles } from "../data/example";
 import { type Inspected, inspect } from "../data/files";
 import { guessRoles, misfit, ROLE_NAMES, ROLES, type Role } from "../data/roles";
@@ -11,6 +11,7 @@ import { bytes, count, significant } from "../format";
 import { type OptionForm, optionForm } from "../options";
 import { Player } from "../player";
 import { errorPanel } from "../problem";
+import { submit } from "../upload";
 
 interface Chosen {
   file: File;
@@ -392,16 +393,16 @@ class SubmitView {
     try {
       let last: Job | null = null;
       for (const [i, chosen] of measured.entries()) {
-        last = await submit(
-          { ...files, measurements: chosen.file },
-          this.form?.values() ?? {},
+        last = await submit({
+          files: { ...files, measurements: chosen.file },
+          options: this.form?.values() ?? {},
           settings,
-          (fraction) => {
+          progress: (fraction) => {
             bar.value = (i + fraction) / measured.length;
             text.textContent = fraction < 1 ? `${Math.round(100 * bar.value)} %` : "Being checked…";
           },
-          stop.signal,
-        );
+          signal: stop.signal,
+        });
         // What is sent is not sent again where a later file is refused.
         if (measured.length > 1) this.chosen = this.chosen.filter((other) => other !== chosen);
       }
