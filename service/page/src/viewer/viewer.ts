@@ -20,9 +20,9 @@ const COLOURINGS: Record<Colouring, string> = {
   plain: "One colour",
 };
 const LEGENDS: Record<Colouring, string> = {
-  depth: "Depth, towards the camera, in the unit of the tracks",
-  motion: "3D motion in a frame, in the unit of the tracks",
-  error: "Distance from the ground truth, in σ (as e3D)",
+  depth: "Depth towards the camera (unit of the tracks)",
+  motion: "3D motion in a frame (unit of the tracks)",
+  error: "Distance from the ground truth (σ, as e3D)",
   plain: "",
 };
 
