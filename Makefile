@@ -53,4 +53,4 @@ pictures:
 	@.venv/bin/python scripts/make_pictures.py
 
 clean:
-	rm -rf .venv docs/build docs/generated service/page/dist service/page/node_modules demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv docs/build docs/generated docs/jupyter_execute service/page/dist service/page/node_modules demo-output .mypy_cache .pytest_cache .ruff_cache .hypothesis

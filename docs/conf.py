@@ -28,7 +28,13 @@ html_copy_source = False
 html_math_renderer = "mathml"
 
 extensions = ["generated", "mathml", "myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["build", "extensions", "notebooks/.*", "**/.ipynb_checkpoints"]
+exclude_patterns = [
+    "build",
+    "extensions",
+    "jupyter_execute",
+    "notebooks/.*",
+    "**/.ipynb_checkpoints",
+]
 default_role = "py:obj"
 
 myst_enable_extensions = ["dollarmath", "attrs_block"]

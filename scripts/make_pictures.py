@@ -38,6 +38,7 @@ def draw_tracks(axes: Axes, measurements: NDArray[np.float64], frame: int) -> No
     tail = tracks[max(frame - 7, 0) : frame + 1, :, chosen].transpose(2, 0, 1)
     axes.add_collection(LineCollection(list(tail), colors=TRACK, linewidths=0.6, alpha=0.45))
     axes.scatter(*tracks[frame][:, chosen], s=3.0, color=INK, linewidths=0, zorder=2)
+    axes.invert_yaxis()  # pixels count from the top
 
 
 def draw_mesh(axes: Axes, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> None:

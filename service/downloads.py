@@ -315,6 +315,7 @@ class ResultFiles:
             frames=self.frames,
             points=self.points,
             camera=self._numbers(self.cameras)[0],
+            translation=self._numbers(self.translations)[0],
             faces=None if self.faces is None else self._numbers(self.faces),
             options=options,
             bounds=self.bounds.get(options.every),

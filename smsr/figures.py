@@ -9,11 +9,13 @@ from __future__ import annotations
 import io
 import threading
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from smsr.errors import FiguresUnavailable, NothingToDraw
+from smsr.files.glb import v_grows_down
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -74,7 +76,7 @@ _lock = threading.Lock()
 """Matplotlib's settings belong to the process, so one figure is drawn at a time."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FigureSource:
     """What figures are drawn from.
 
@@ -90,8 +92,9 @@ class FigureSource:
         Gives rows ``start`` to ``stop`` of the shapes as a (T N, 3) matrix.
     faces : ndarray of shape (F, 3), optional
         Triangles; drawn where there are at most `MOST_TRIANGLES`.
-    image_v : "up" or "down"
-        Where the second image coordinate grows to.
+    image_v : "auto", "up" or "down"
+        Where the second image coordinate grows to; "auto" is "down" where the first frame has no
+        negative coordinates.
     """
 
     report: Mapping[str, Any]
@@ -100,13 +103,19 @@ class FigureSource:
     points: int
     read: Callable[[int, int], Array]
     faces: NDArray[np.integer[Any]] | None = None
-    image_v: ImageV = "up"
+    image_v: ImageV = "auto"
 
-    @property
+    @cached_property
+    def down(self) -> bool:
+        """Whether the second image coordinate grows downwards."""
+        first = self.frame(0, -(-self.points // MOST_POINTS))
+        return v_grows_down(self.image_v, first, self.cameras[0], self.translations[0])
+
+    @cached_property
     def rotations(self) -> NDArray[np.float64]:
         """Rotations (T, 3, 3) to x right, y up, z towards the viewer."""
         cameras = np.asarray(self.cameras, np.float64).copy()
-        if self.image_v == "down":
+        if self.down:
             cameras[:, 1] *= -1.0
         depth = np.cross(cameras[:, 0], cameras[:, 1])
         return np.concatenate([cameras, depth[:, None]], axis=1)
@@ -410,7 +419,7 @@ def _cameras(figure: Figure, source: FigureSource) -> None:
         limit(middle - half, middle + half)
     image.set_aspect("equal")
     image.locator_params(nbins=5)
-    if source.image_v == "down":
+    if source.down:
         image.invert_yaxis()
     image.set_title("centre of the object in the image")
     image.set_xlabel("u (unit of the measurements)")

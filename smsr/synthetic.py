@@ -53,8 +53,8 @@ def make_example(frames: int = 60, side: int = 40, seed: int = 0) -> Example:
     Returns
     -------
     Example
-        Units are pixels of an image about 640 wide. The shapes are a mean and five modes of
-        deformation, so the centred W has a rank of at most 18.
+        Units are pixels of an image about 640 wide, v counted from the top. The shapes are a mean
+        and five modes of deformation, so the centred W has a rank of at most 18.
     """
     rng = np.random.default_rng(seed)
     shapes, faces = _mask(frames, side, rng)
@@ -66,6 +66,7 @@ def make_example(frames: int = 60, side: int = 40, seed: int = 0) -> Example:
     pitch = np.radians(24.0) * np.sin(2.0 * np.pi * 1.1 * time + tilt)
     roll = np.radians(6.0) * np.sin(2.0 * np.pi * 0.7 * time)
     cameras = _cameras(yaw, pitch, roll)
+    cameras[:, 1] *= -1.0  # pixels count from the top
     drift = np.stack([320.0 + 25.0 * np.sin(5.0 * time), 240.0 + 15.0 * np.cos(4.0 * time)], axis=1)
     return Example(_project(cameras, shapes, drift), shapes, faces, cameras)
 

@@ -144,7 +144,13 @@ def reconstruct(
         report["metrics"] = None if error is None else error.to_dict()
         _write(target, result, triangles, report, ply=ply)
         if glb:
-            write_glb(target / "result.glb", result.shapes, result.cameras, triangles)
+            write_glb(
+                target / "result.glb",
+                result.shapes,
+                result.cameras,
+                triangles,
+                translations=result.translations,
+            )
     if as_json:
         console.print_json(data=report)
     else:

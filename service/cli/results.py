@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from service.cli.exits import console, errors
 from smsr.errors import ArrayNotFound, NothingToDraw
 from smsr.figures import NAMES, FigureFormat, FigureName, FigureSource, draw
-from smsr.files import GlbOptions, load_faces, open_result, write_glb
+from smsr.files import GlbOptions, load_faces, open_result, write_glb, write_xdmf
 from smsr.files.glb import ImageV
 
 if TYPE_CHECKING:
@@ -31,8 +31,12 @@ def convert(
     result: Result,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="FILE.glb", help="[default: beside RESULT]"),
+        typer.Option("-o", "--out", metavar="FILE", help="[default: beside RESULT]"),
     ] = None,
+    form: Annotated[
+        Literal["glb", "xdmf"],
+        typer.Option("--format", help="glb for viewers and Blender, xdmf for ParaView."),
+    ] = "glb",
     fps: Annotated[
         float, typer.Option(min=0.001, max=1000, help="Frames of the sequence per second.")
     ] = DEFAULTS.fps,
@@ -41,21 +45,30 @@ def convert(
     ] = False,
     every: Annotated[int, typer.Option(min=1, help="Take every n-th frame.")] = 1,
     image_v: Annotated[
-        ImageV, typer.Option(help="Where the second image coordinate grows to; down for pixels.")
+        ImageV,
+        typer.Option(
+            help="Where the second image coordinate grows to: down for pixels; auto: by its signs."
+        ),
     ] = DEFAULTS.image_v,
 ) -> None:
-    """Write a result as one animated GLB, for Blender and viewers.
+    """Write a result as one animated GLB, for Blender and viewers, or as XDMF, for ParaView.
 
-    It stands upright and as the first camera saw it. With faces in the result it is a mesh, and
-    otherwise points coloured by depth.
+    A GLB stands upright and as the first camera saw it. With faces in the result it is a mesh, and
+    otherwise points coloured by depth. An XDMF file is small: it names positions in result.npz,
+    which has to stay where it is from there.
     """
     source = result / "result.npz" if result.is_dir() else result
-    target = out or source.with_suffix(".glb")
+    target = out or source.with_suffix(f".{form}")
+    if form == "xdmf":
+        if quantised or image_v != DEFAULTS.image_v:
+            raise typer.BadParameter("--quantised and --image-v are for --format glb.")
+        write_xdmf(target, source, fps=fps, every=every)
+        console.print(f"Wrote {target}, which reads {source}", soft_wrap=True)
+        return
     found = open_result(source)
     faces = _faces_of(source, found.shapes.shape[1])
-    write_glb(
-        target, found.shapes, found.cameras, faces, GlbOptions(fps, quantised, every, image_v)
-    )
+    options = GlbOptions(fps, quantised, every, image_v)
+    write_glb(target, found.shapes, found.cameras, faces, options, found.translations)
     console.print(f"Wrote {target} ({target.stat().st_size / 2**20:.1f} MiB)", soft_wrap=True)
 
 
@@ -71,7 +84,10 @@ def plot(
     ] = None,
     form: Annotated[FigureFormat, typer.Option("--format", help="Kind of picture.")] = "png",
     image_v: Annotated[
-        ImageV, typer.Option(help="Where the second image coordinate grows to; down for pixels.")
+        ImageV,
+        typer.Option(
+            help="Where the second image coordinate grows to: down for pixels; auto: by its signs."
+        ),
     ] = DEFAULTS.image_v,
 ) -> None:
     """Draw a result: convergence, singular values, error, shapes and cameras.

@@ -149,8 +149,11 @@ async def get_glb(
     every: Annotated[int, Query(ge=1, le=1_000_000, description="Take every n-th frame.")] = 1,
     image_v: Annotated[
         ImageV,
-        Query(description="Where the second image coordinate grows to: `down` for pixels."),
-    ] = "up",
+        Query(
+            description="Where the second image coordinate grows to: `down` for pixels; `auto` is "
+            "`down` where the first frame has no negative coordinates."
+        ),
+    ] = "auto",
 ) -> Download:
     """Return the surface, as a mesh where faces were sent and as points otherwise, and its motion.
 
@@ -290,8 +293,11 @@ async def get_figure(
     form: FigureFormat,
     image_v: Annotated[
         ImageV,
-        Query(description="Where the second image coordinate grows to: `down` for pixels."),
-    ] = "up",
+        Query(
+            description="Where the second image coordinate grows to: `down` for pixels; `auto` is "
+            "`down` where the first frame has no negative coordinates."
+        ),
+    ] = "auto",
 ) -> Download:
     """Return a picture of the residuals, the singular values, the error, the shapes or the cameras.
 

@@ -10,6 +10,7 @@ from smsr.files.ply import ply_face_block, ply_header, write_ply
 from smsr.files.prefix import Beginning, check_prefix
 from smsr.files.results import open_result
 from smsr.files.selection import Role
+from smsr.files.xdmf import write_xdmf
 
 __all__ = [
     "DEFAULT_LIMIT",
@@ -30,4 +31,5 @@ __all__ = [
     "write_glb",
     "write_npz",
     "write_ply",
+    "write_xdmf",
 ]

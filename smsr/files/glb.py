@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     Array = NDArray[Any]
     ReadRows = Callable[[int, int], Array]
 
-ImageV = Literal["up", "down"]
-"""Where the second image coordinate of the measurements grows to."""
+ImageV = Literal["auto", "up", "down"]
+"""Where the second image coordinate of the measurements grows to; "auto" is as `v_grows_down`."""
 
 MOST_FRAMES = 2048
 """Layers that graphics processors commonly give an array texture; viewers keep a frame in each."""
@@ -80,14 +80,15 @@ class GlbOptions:
         viewer reads. Positions are then exact to 1/32767 of the extent.
     every : int
         Takes only every n-th frame, from the first on.
-    image_v : "up" or "down"
-        Where the second image coordinate grows to: "down" for pixels counted from the top.
+    image_v : "auto", "up" or "down"
+        Where the second image coordinate grows to: "down" for pixels counted from the top; "auto"
+        is "down" where the first frame has no negative coordinates.
     """
 
     fps: float = 25.0
     quantised: bool = False
     every: int = 1
-    image_v: ImageV = "up"
+    image_v: ImageV = "auto"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +119,24 @@ class Bounds:
         return max(float(np.abs(self.first).max()), moves) or 1.0
 
 
+def v_grows_down(image_v: ImageV, shape: Array, camera: Array, translation: Array) -> bool:
+    """Tell whether the second image coordinate grows downwards.
+
+    Parameters
+    ----------
+    image_v : "auto", "up" or "down"
+        "auto": it does where no coordinate is negative, as pixels are not.
+    shape : ndarray of shape (N, 3)
+        Of one frame.
+    camera, translation : ndarrays of shapes (2, 3) and (2,)
+        Of the same frame.
+    """
+    if image_v != "auto":
+        return image_v == "down"
+    lowest = (np.asarray(shape, np.float64) @ np.asarray(camera).T + translation).min()
+    return bool(lowest >= 0.0)
+
+
 class Glb:
     """A GLB file that can be read from any position.
 
@@ -129,6 +148,8 @@ class Glb:
         T and N.
     camera : ndarray of shape (2, 3)
         R of the first frame: the object stands as this camera saw it.
+    translation : ndarray of shape (2,), optional
+        t of the first frame, by which ``image_v="auto"`` is decided; otherwise it is "up".
     faces : ndarray of shape (F, 3), optional
         Triangles, indices of points from 0; without them, the file holds a cloud of points that
         are coloured by depth.
@@ -156,6 +177,7 @@ class Glb:
         frames: int,
         points: int,
         camera: Array,
+        translation: Array | None = None,
         faces: Array | None = None,
         options: GlbOptions | None = None,
         bounds: Bounds | None = None,
@@ -170,8 +192,12 @@ class Glb:
             _Normals(self._faces, points) if self._faces is not None and shaded else None
         )
         self._record = _record(options.quantised, shaded)
-        self._turn = _upright(camera, options.image_v)
         self._check(frames)
+        if translation is None:
+            down = options.image_v == "down"
+        else:
+            down = v_grows_down(options.image_v, read(0, points), camera, translation)
+        self._turn = _upright(camera, down=down)
         self.bounds = bounds or self._measure()
         self._parts = list(self._small_parts())
         head = self._json()
@@ -447,6 +473,7 @@ def write_glb(
     cameras: Array,
     faces: Array | None = None,
     options: GlbOptions | None = None,
+    translations: Array | None = None,
 ) -> None:
     """Write a moving surface as an animated GLB.
 
@@ -460,6 +487,8 @@ def write_glb(
     faces : ndarray of shape (F, 3), optional
         Triangles, point indices from 0; without them, the file holds points.
     options : GlbOptions, optional
+    translations : ndarray of shape (T, 2), optional
+        By which ``image_v="auto"`` is decided; otherwise it is "up".
 
     Raises
     ------
@@ -473,6 +502,7 @@ def write_glb(
         frames=frames,
         points=points,
         camera=cameras[0],
+        translation=None if translations is None else translations[0],
         faces=faces,
         options=options,
     )
@@ -562,10 +592,10 @@ def _quantise(values: Array, span: float) -> NDArray[np.int16]:
     return found
 
 
-def _upright(camera: Array, image_v: ImageV) -> NDArray[np.float64]:
+def _upright(camera: Array, *, down: bool) -> NDArray[np.float64]:
     """Return the rotation (3, 3) from the object frame to x right, y up, z towards the viewer."""
     right, v = np.asarray(camera, np.float64)
-    up = v if image_v == "up" else -v
+    up = -v if down else v
     return np.stack([right, up, np.cross(right, up)])
 
 

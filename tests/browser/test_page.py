@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import re
+import zipfile
 from typing import TYPE_CHECKING, Any
 
 import httpx
@@ -15,7 +16,7 @@ import pytest
 from playwright.sync_api import expect
 
 from smsr.synthetic import make_example
-from tests.browser.conftest import PATIENCE, visiting
+from tests.browser.conftest import FLAGS, PATIENCE, find_chromium, visiting
 from tests.conftest import ROOT, redis_running
 from tests.service.conftest import api_running, finished, npy, settings_for
 from worker.keys import KeyStore
@@ -292,7 +293,7 @@ def test_downloads_are_the_bytes_of_the_api(
         name = download.value.suggested_filename
         suffix = next((end for end in wanted if name.endswith(end)), None)
         if suffix is None:
-            assert name.endswith(".glb"), name
+            assert name.endswith(".glb"), name  # test_the_view_stands_upright
             continue
         download.value.save_as(tmp_path / name)
         assert (tmp_path / name).read_bytes() == httpx.get(
@@ -301,6 +302,169 @@ def test_downloads_are_the_bytes_of_the_api(
     assert wanted == {}
     arrays = np.load(next(tmp_path.glob("*.npz")))
     assert arrays["shapes"].shape == (30, 400, 3)
+
+
+def test_the_view_stands_upright(visit: Visit, job: dict[str, Any], tmp_path: Path) -> None:
+    """Pixels count from the top; who has other tracks turns the view, and what is made of it."""
+    page = still_viewer_of(visit, job)
+    expect(page.locator("#up")).not_to_be_checked()
+    page.locator(".scrub").fill("5")
+    before = picture(page), picture(page, ".stage-2d canvas")
+    page.check("#up")
+    assert picture(page) != before[0]
+    assert picture(page, ".stage-2d canvas") != before[1]
+    with page.expect_download() as download:
+        page.get_by_role("button", name="GLB").click()
+    download.value.save_as(tmp_path / "up.glb")
+    given = {
+        v: httpx.get(visit.api.url + job["links"]["glb"], params={"image_v": v}).content
+        for v in ("auto", "up", "down")
+    }
+    assert (tmp_path / "up.glb").read_bytes() == given["up"] != given["down"] == given["auto"]
+    page.uncheck("#up")
+    page.evaluate("scrollTo(0, 0)")  # else the same pixels lie between others
+    page.wait_for_timeout(300)
+    assert (picture(page), picture(page, ".stage-2d canvas")) == before
+
+
+def test_figures_are_drawn_when_they_are_wanted(
+    visit: Visit, job: dict[str, Any], tmp_path: Path
+) -> None:
+    page = still_viewer_of(visit, job)
+    assert page.locator(".figures canvas").count() == 0
+    page.get_by_text("Figures", exact=True).click()
+    expect(page.locator(".figures canvas")).to_have_count(5)
+    assert pixels(page, ".figures canvas >> nth=0") > 10_000
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Error of each frame, SVG").click()
+    download.value.save_as(tmp_path / "error.svg")
+    address = job["links"]["figure"].format(name="error", form="svg")
+    assert (tmp_path / "error.svg").read_bytes() == httpx.get(visit.api.url + address).content
+
+
+def test_several_sequences_become_a_batch(
+    visit: Visit, files: dict[str, bytes], tmp_path: Path
+) -> None:
+    page = visit.open()
+    drop(page, {"one.npy": files["tracks.npy"], "two.npy": files["tracks.npy"]})
+    expect(page.locator(".hint")).to_contain_text("2 jobs")
+    page.get_by_label("Batch").fill("pair-1")
+    page.get_by_label("Priority").select_option("high")
+    page.get_by_role("button", name="Send").click()
+    expect(page.get_by_role("heading", name="Batch pair-1")).to_be_visible()
+    expect(page.locator(".batch")).to_contain_text("2: 2 done")
+    expect(page.locator("tbody tr")).to_have_count(2)
+    jobs = httpx.get(f"{visit.api.url}/v1/jobs", params={"batch": "pair-1"}).json()["jobs"]
+    assert {(job["name"], job["priority"]) for job in jobs} == {
+        ("one.npy", "high"),
+        ("two.npy", "high"),
+    }
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Results as ZIP").click()
+    download.value.save_as(tmp_path / "pair.zip")
+    with zipfile.ZipFile(tmp_path / "pair.zip") as archive:
+        assert sum(name.endswith("result.npz") for name in archive.namelist()) == 2
+    visit.open("/#/jobs")
+    page.get_by_role("link", name="pair-1").first.click()
+    visit.refusals_expected = True  # the batch is looked for once it is gone
+    page.get_by_role("button", name="Delete all").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.locator(".notice")).to_contain_text("No job of this batch is left")
+    expect(page.locator("tbody tr")).to_have_count(0)
+
+
+def test_what_will_not_fit_is_said_before_it_is_sent(visit: Visit, files: dict[str, bytes]) -> None:
+    W = np.load(io.BytesIO(files["tracks.npy"]))
+    gaps = W.copy()
+    gaps[10:12, ::5] = np.nan
+    page = visit.open()
+    drop(page, {"gaps.npy": npy(gaps), "truth.npy": npy(np.zeros((30, 7, 3)))})
+    expect(page.locator(".files")).to_contain_text("T = 30 and N = 400")
+    page.get_by_role("button", name="Remove truth.npy").click()
+    note = page.locator(".preview .note")
+    expect(note).to_contain_text("0.67 % of the positions are not seen")
+    page.get_by_label("Missing").select_option("complete")
+    expect(note).to_be_hidden()
+    page.get_by_role("button", name="Send").click()
+    page.wait_for_selector(".viewer[data-complete]")
+    page = visit.open()
+    page.reload()
+    drop(page, {"odd.npy": npy(W[:-1])})
+    expect(page.locator(".files .note")).to_contain_text("no tracks")
+
+
+def test_the_page_goes_on_when_the_service_is_back(
+    browser: Browser,
+    page_built: Path,
+    files: dict[str, bytes],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    assert page_built.is_dir()
+    folder = tmp_path_factory.mktemp("away")
+    with contextlib.ExitStack() as stack:
+        redis = stack.enter_context(redis_running(folder))
+        settings = settings_for(folder, redis)
+        first = contextlib.ExitStack()
+        api = first.enter_context(api_running(settings, redis, folder / "api.log"))
+        visit = stack.enter_context(visiting(browser, api))
+        visit.refusals_expected = True
+        with first:
+            page = visit.open()
+            drop(page, {"tracks.npy": files["tracks.npy"]})
+            page.get_by_role("button", name="Send").click()
+            expect(page.locator(".stage-name")).to_contain_text("Waiting")
+            expect(page.locator("#away")).to_be_hidden()
+        expect(page.locator("#away")).to_contain_text("does not answer")
+        port = int(api.url.rpartition(":")[2])
+        stack.enter_context(api_running(settings, redis, folder / "again.log", port))
+        expect(page.locator("#away")).to_be_hidden()
+        stack.enter_context(WorkerPool(settings, 1))
+        page.wait_for_selector(".viewer[data-complete]")
+
+
+def test_a_large_upload_goes_on_where_it_broke(
+    browser: Browser, page_built: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    assert page_built.is_dir()
+    folder = tmp_path_factory.mktemp("large")
+    example = make_example(frames=20, side=460)
+    np.save(folder / "large.npy", example.measurements)
+    assert (folder / "large.npy").stat().st_size > 64e6
+    with contextlib.ExitStack() as stack:
+        redis = stack.enter_context(redis_running(folder))
+        settings = settings_for(folder, redis, max_upload_bytes=2**30, max_array_bytes=2**30)
+        crashing = stack.enter_context(api_running(settings, redis, folder / "api.log"))
+        visit = stack.enter_context(visiting(browser, crashing))
+        visit.refusals_expected = True
+        offsets: list[int] = []
+        visit.page.on(
+            "request",
+            lambda request: (
+                offsets.append(int(request.headers["upload-offset"]))
+                if request.method == "PATCH"
+                else None
+            ),
+        )
+        page = visit.open()
+        page.set_input_files("#files", folder / "large.npy")
+        page.context.new_cdp_session(page).send(
+            "Network.emulateNetworkConditions",
+            {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 2e7},
+        )
+        page.get_by_role("button", name="Send").click()
+        percent = page.locator(".sending span")
+        expect(percent).to_have_text(re.compile(r"^[2-9]\d %"))
+        crashing.process.kill()
+        expect(page.locator("#away")).to_be_visible()
+        port = int(crashing.url.rpartition(":")[2])
+        stack.enter_context(api_running(settings, redis, folder / "again.log", port))
+        stack.enter_context(WorkerPool(settings, 1))
+        page.wait_for_selector(".viewer[data-loaded]")
+        assert offsets[0] == 0
+        assert offsets[-1] > 5e6
+        job = httpx.get(f"{crashing.url}/v1/jobs/{page.url.rpartition('/')[2]}").json()
+        sent = httpx.get(crashing.url + job["inputs"]["measurements"]["link"]).content
+        assert sent == (folder / "large.npy").read_bytes()
 
 
 def test_a_file_that_is_none_is_refused_in_words(visit: Visit) -> None:
@@ -420,6 +584,46 @@ def test_the_list_follows_jobs_and_deletes_them(
         assert client.get(sent.headers["Location"]).status_code == 404
 
 
+def test_a_job_is_cancelled_and_run_again(visit: Visit, site: Api, files: dict[str, bytes]) -> None:
+    endless = {
+        "camera_model": "relaxed",
+        "shape_method": "nuclear",
+        "shape_iterations": 100_000,
+        "shape_tolerance": 1e-15,
+    }
+    sent = {"measurements": ("endless.npy", files["tracks.npy"])}
+    with site.client() as client:
+        job = client.post("/v1/jobs", files=sent, data={"options": json.dumps(endless)}).json()
+    page = visit.open(f"/#/jobs/{job['id']}")
+    expect(page.locator(".badge")).to_contain_text("Running")
+    expect(page.locator(".percent")).to_contain_text("%")
+    for again in (True, False):
+        page.get_by_role("button", name="Cancel").click()
+        expect(page.locator(".notice")).to_contain_text("was cancelled")
+        if again:
+            page.get_by_role("button", name="Run again").click()
+            expect(page.locator(".facts")).to_contain_text("attempt 2")
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.get_by_role("heading", name="Jobs", exact=True)).to_be_visible()
+    visit.refusals_expected = True
+    visit.open(f"/#/jobs/{job['id']}")
+    expect(page.get_by_role("heading", name="No such job")).to_be_visible()
+
+
+def test_without_3d_the_rest_is_there(
+    page_built: Path, site: Api, job: dict[str, Any], browser: Browser
+) -> None:
+    assert page_built.is_dir()
+    with browser.browser_type.launch(
+        executable_path=find_chromium(), args=[*FLAGS, "--disable-3d-apis"]
+    ) as flat:
+        page = flat.new_page()
+        page.goto(f"{site.url}/#/jobs/{job['id']}")
+        expect(page.locator(".viewer")).to_contain_text("draws no 3D")
+        expect(page.locator(".downloads button")).to_have_count(5)
+
+
 def test_a_key_is_asked_for_where_one_is_needed(
     browser: Browser,
     page_built: Path,
@@ -450,6 +654,11 @@ def test_a_key_is_asked_for_where_one_is_needed(
         with page.expect_download() as download:
             page.locator(".downloads button").first.click()
         assert download.value.path().stat().st_size > 1000
+        with page.expect_download() as download:
+            page.get_by_role("button", name="This job as JSON").click()
+        assert json.loads(download.value.path().read_text())["status"] == "succeeded"
+        page.get_by_text("Figures", exact=True).click()
+        expect(page.locator(".figures canvas")).to_have_count(4)
         assert page.evaluate("localStorage.length") == 0
 
 
@@ -501,7 +710,15 @@ def test_no_serious_finding_of_axe(
         page.reload()
         page.wait_for_selector("tbody tr")
         look("jobs")
+        with site.client() as client:
+            sent = {"measurements": ("tracks.npy", files["tracks.npy"])}
+            finished(client, client.post("/v1/jobs", files=sent, data={"batch": "axe"}))
+        visit.open("/#/batches/axe")
+        page.wait_for_selector(".batch progress")
+        look("batch")
         viewer_of(visit, job)
         page.get_by_text("Keyboard", exact=True).click()
+        page.get_by_text("Figures", exact=True).click()
+        page.wait_for_selector(".figures canvas")
         look("viewer")
         assert found == {}

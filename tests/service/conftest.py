@@ -124,9 +124,11 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def api_running(settings: Settings, redis: RedisProcess, log: Path) -> Iterator[Api]:
+def api_running(
+    settings: Settings, redis: RedisProcess, log: Path, port: int | None = None
+) -> Iterator[Api]:
     """Run the application in uvicorn until the block ends."""
-    port = free_port()
+    port = port or free_port()
     command = [sys.executable, "-m", "uvicorn", "--factory", "service.app:app_from_environment"]
     more = ["--port", str(port), "--log-level", "warning", "--timeout-graceful-shutdown", "3"]
     with (

@@ -19,7 +19,7 @@ import pytest
 
 from service.cli import main
 from smsr.figures import NAMES
-from smsr.files import GlbOptions, open_result, write_glb
+from smsr.files import GlbOptions, open_result, write_glb, write_xdmf
 from smsr.synthetic import write_example
 from tests.conftest import clean_environment, serving
 
@@ -96,15 +96,26 @@ def test_the_frames_are_meshes_others_can_read(result: Path) -> None:
 def test_a_result_becomes_an_animation(result: Path, example: Path, tmp_path: Path) -> None:
     found = open_result(result / "result.npz")
     faces = np.load(example / "faces.npy")
-    write_glb(tmp_path / "expected.glb", found.shapes, found.cameras, faces)
+    arrays = found.shapes, found.cameras, faces
+    write_glb(tmp_path / "expected.glb", *arrays, translations=found.translations)
     succeeded(smsr("convert", result, "-o", tmp_path / "a.glb"))
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "expected.glb").read_bytes()
     more = ["--quantised", "--every", "2", "--image-v", "down", "--fps", "10"]
     shown = succeeded(smsr("convert", result / "result.npz", "-o", tmp_path / "b.glb", *more))
     assert str(tmp_path / "b.glb") in shown
     options = GlbOptions(10.0, quantised=True, every=2, image_v="down")
-    write_glb(tmp_path / "expected.glb", found.shapes, found.cameras, faces, options)
+    write_glb(tmp_path / "expected.glb", *arrays, options)
     assert (tmp_path / "b.glb").read_bytes() == (tmp_path / "expected.glb").read_bytes()
+
+
+def test_a_result_becomes_a_series_for_paraview(result: Path) -> None:
+    shown = succeeded(smsr("convert", result, "--format", "xdmf", "--fps", "10", "--every", "2"))
+    assert str(result / "result.xdmf") in shown
+    write_xdmf(result / "expected.xdmf", result / "result.npz", fps=10, every=2)
+    assert (result / "result.xdmf").read_bytes() == (result / "expected.xdmf").read_bytes()
+    refused = smsr("convert", result, "--format", "xdmf", "--quantised")
+    assert refused.returncode == 2
+    assert "--format glb" in refused.stderr
 
 
 def test_reconstruct_writes_an_animation_where_asked(example: Path, tmp_path: Path) -> None:

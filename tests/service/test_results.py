@@ -168,7 +168,14 @@ def test_the_animation_is_that_of_the_result(
             answer = client.get(document["links"]["glb"], params=query)
             assert answer.headers["content-type"] == "model/gltf-binary"
             assert int(answer.headers["content-length"]) == len(answer.content)
-            write_glb(tmp_path / "a.glb", expected.shapes, expected.cameras, faces, options)
+            write_glb(
+                tmp_path / "a.glb",
+                expected.shapes,
+                expected.cameras,
+                faces,
+                options,
+                expected.translations,
+            )
             assert answer.content == (tmp_path / "a.glb").read_bytes()
             part = client.get(
                 document["links"]["glb"],

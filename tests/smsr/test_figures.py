@@ -138,11 +138,15 @@ def test_large_results_are_thinned(source: FigureSource) -> None:
     assert frames == {0, 6, 13, 19, 3}
 
 
-def test_pixels_may_count_downwards(source: FigureSource) -> None:
+def test_v_may_grow_both_ways(source: FigureSource) -> None:
+    """The example has pixels, which count from the top; its mirror image stands the same."""
+    assert source.down
     flipped = source.cameras * np.array([[1.0], [-1.0]])
-    down = dataclasses.replace(source, cameras=flipped, image_v="down")
-    np.testing.assert_allclose(down.rotations, source.rotations)
-    assert draw("shapes", down) == draw("shapes", source)
+    up = dataclasses.replace(source, cameras=flipped, image_v="up")
+    np.testing.assert_allclose(up.rotations, source.rotations)
+    assert draw("shapes", up) == draw("shapes", source)
+    centred = dataclasses.replace(source, translations=np.zeros_like(source.translations))
+    assert not centred.down
 
 
 def test_view_angles_are_those_that_the_camera_turned_by() -> None:

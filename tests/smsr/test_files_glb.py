@@ -14,7 +14,7 @@ import pytest
 
 from smsr.errors import AnimationTooLarge
 from smsr.files import GlbOptions, write_glb
-from smsr.files.glb import MOST_FRAMES, Glb
+from smsr.files.glb import MOST_FRAMES, Glb, v_grows_down
 from smsr.synthetic import make_example
 
 if TYPE_CHECKING:
@@ -231,6 +231,28 @@ def test_the_first_camera_looks_at_it_from_the_front() -> None:
     flipped = down["nodes"][0]["rotation"]
     # The same view, turned by 180 degrees about the axis that points right.
     np.testing.assert_allclose(np.abs(flipped), np.abs([w, z, y, x]), atol=1e-12)
+
+
+def test_pixels_are_told_by_their_signs(tmp_path: Path) -> None:
+    shape, camera = SHAPES[0], EXAMPLE.cameras[0]
+    centre = np.ptp(shape @ camera.T, axis=0)
+    for translation, down in ((centre, True), (0.1 * centre, False), (-centre, False)):
+        assert v_grows_down("auto", shape, camera, translation) is down
+        assert v_grows_down("up", shape, camera, translation) is False
+        assert v_grows_down("down", shape, camera, translation) is True
+    written = {}
+    for image_v, translations in (("auto", True), ("down", True), ("up", True), ("auto", False)):
+        path = tmp_path / "a.glb"
+        write_glb(
+            path,
+            SHAPES,
+            EXAMPLE.cameras,
+            options=GlbOptions(image_v=image_v),  # type: ignore[arg-type]
+            translations=np.tile(centre, (len(SHAPES), 1)) if translations else None,
+        )
+        written[image_v, translations] = path.read_bytes()
+    assert written["auto", True] == written["down", True] != written["up", True]
+    assert written["auto", False] == written["up", True]
 
 
 def test_integers_take_less_room() -> None:

@@ -15,6 +15,7 @@ export interface Job {
   id: string;
   status: Status;
   name: string | null;
+  batch: string | null;
   created_at: string;
   started_at: string | null;
   finished_at: string | null;
@@ -38,6 +39,27 @@ export interface Job {
   } | null;
   problem: Problem | null;
   links: Record<string, string | null | undefined>;
+}
+
+/** How some numbers lie. */
+export interface Spread {
+  count: number;
+  mean: number;
+  median: number;
+  min: number;
+  max: number;
+}
+
+/** Jobs that share a label; the lower members are missing in a list. */
+export interface Batch {
+  label: string;
+  total: number;
+  jobs: Record<Status, number>;
+  created_at: string;
+  links: Record<"self" | "jobs" | "cancel" | "retry" | "results", string | null>;
+  progress?: number;
+  e3d?: Spread | null;
+  timings?: { elapsed: number | null; run_total: number; run: Spread | null };
 }
 
 export interface Metrics {
@@ -95,7 +117,19 @@ export const key = {
 /** Called when the service wants a key, or another one. */
 export const onKeyWanted = new Set<() => void>();
 
-function authorised(headers: HeadersInit = {}): Headers {
+/** Whether the service answers, as the last request found. */
+export const connection = {
+  lost: false,
+  /** Called when it is lost, and when it is there again. */
+  onchange: new Set<() => void>(),
+  set(lost: boolean): void {
+    if (lost === this.lost) return;
+    this.lost = lost;
+    for (const changed of this.onchange) changed();
+  },
+};
+
+export function authorised(headers: HeadersInit = {}): Headers {
   const all = new Headers(headers);
   const known = key.get();
   if (known) all.set("Authorization", `Bearer ${known}`);
@@ -109,13 +143,15 @@ export async function ask(path: string, init: RequestInit = {}): Promise<Respons
     answer = await fetch(address(path), { ...init, headers: authorised(init.headers) });
   } catch (error) {
     if ((error as Error).name === "AbortError") throw error;
+    connection.set(true);
     throw new Unreachable();
   }
+  connection.set(false);
   if (answer.ok || answer.status === 304) return answer;
   throw refusal(answer.status, await answer.text());
 }
 
-function refusal(status: number, body: string): Refused {
+export function refusal(status: number, body: string): Refused {
   if (status === 401) for (const wanted of onKeyWanted) wanted();
   try {
     const problem = JSON.parse(body) as Problem;
@@ -127,7 +163,7 @@ function refusal(status: number, body: string): Refused {
   return new Refused({ type: "about:blank", title, status });
 }
 
-async function json<T>(path: string, init?: RequestInit): Promise<T> {
+export async function json<T>(path: string, init?: RequestInit): Promise<T> {
   return (await ask(path, init)).json() as Promise<T>;
 }
 
@@ -146,8 +182,14 @@ export const getJob = (id: string, signal?: AbortSignal): Promise<Job> =>
 export const listJobs = (path: string, signal?: AbortSignal) =>
   json<{ jobs: Job[]; next: string | null }>(path, { signal });
 
-export const post = (path: string): Promise<Job> => json<Job>(path, { method: "POST" });
-export const remove = (job: Job): Promise<Response> => ask(job.links.self!, { method: "DELETE" });
+export const getBatch = (label: string, signal?: AbortSignal): Promise<Batch> =>
+  json<Batch>(`v1/batches/${encodeURIComponent(label)}`, { signal });
+
+export const listBatches = (signal?: AbortSignal) =>
+  json<{ batches: Batch[]; next: string | null }>("v1/batches?limit=20", { signal });
+
+export const post = <T>(path: string): Promise<T> => json<T>(path, { method: "POST" });
+export const remove = (path: string): Promise<Response> => ask(path, { method: "DELETE" });
 
 /** What the documentation of a problem's type advises. */
 export async function remedyOf(problem: Problem): Promise<string | null> {
@@ -159,40 +201,6 @@ export async function remedyOf(problem: Problem): Promise<string | null> {
   } catch {
     return null;
   }
-}
-
-/**
- * Send a job.
- *
- * XMLHttpRequest, because fetch does not tell how much of a body has been sent.
- */
-export function submit(
-  files: Partial<Record<string, File>>,
-  options: Record<string, unknown>,
-  progress: (fraction: number) => void,
-  signal: AbortSignal,
-): Promise<Job> {
-  const form = new FormData();
-  form.set("options", JSON.stringify(options));
-  for (const [role, file] of Object.entries(files)) if (file) form.set(role, file, file.name);
-  return new Promise((resolve, reject) => {
-    const request = new XMLHttpRequest();
-    request.open("POST", address("v1/jobs"));
-    authorised().forEach((value, name) => {
-      request.setRequestHeader(name, value);
-    });
-    request.upload.addEventListener("progress", (event) => {
-      if (event.lengthComputable) progress(event.loaded / event.total);
-    });
-    request.addEventListener("load", () => {
-      if (request.status >= 200 && request.status < 300) resolve(JSON.parse(request.responseText));
-      else reject(refusal(request.status, request.responseText));
-    });
-    request.addEventListener("error", () => reject(new Unreachable()));
-    request.addEventListener("abort", () => reject(new DOMException("stopped", "AbortError")));
-    signal.addEventListener("abort", () => request.abort());
-    request.send(form);
-  });
 }
 
 /** Save a file: by its address where that is enough, else with the key, through memory. */

@@ -62,10 +62,8 @@ const ICONS: Record<string, string> = {
   close: "M6 6l12 12M18 6 6 18",
   retry: "M20 11a8 8 0 1 0-2.3 6.3M20 4v7h-7",
   bin: "M4 7h16M9 7V4h6v3m3 0-1 13H7L6 7",
-  view: "M3 9V4h5M21 9V4h-5M3 15v5h5M21 15v5h-5",
-  cube: "M12 2.5 20.5 7v10L12 21.5 3.5 17V7zM3.5 7 12 11.5 20.5 7M12 11.5v10",
+  view: "M12 2.5v5m0 9v5M2.5 12h5m9 0h5M12 7.5a4.5 4.5 0 1 0 .01 0z",
   key: "M14 10a4.5 4.5 0 1 0-1.5 3.3L15 16h3v3h3v-3.5l-7-5.5",
-  help: "M9.5 9a2.6 2.6 0 1 1 3.6 2.5c-.8.3-1.1.9-1.1 1.7v.3M12 17.4v.1",
 };
 const SOLID = new Set(["play", "pause", "back", "forward"]);
 

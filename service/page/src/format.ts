@@ -45,7 +45,7 @@ export function ago(moment: string): string {
 }
 
 export const exact = (moment: string): string =>
-  new Date(moment).toLocaleString("en", { dateStyle: "medium", timeStyle: "medium" });
+  new Date(moment).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
 
 export const sentence = (text: string): string => text.charAt(0).toUpperCase() + text.slice(1);
 

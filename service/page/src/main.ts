@@ -1,7 +1,8 @@
 /** The page: which view an address shows, and the key where the service asks for one. */
 
-import { info, key, onKeyWanted } from "./api";
+import { ask, connection, info, key, onKeyWanted } from "./api";
 import { h, icon, replace } from "./dom";
+import { batchView } from "./views/batch";
 import { jobView } from "./views/job";
 import { jobsView } from "./views/jobs";
 import { submitView } from "./views/submit";
@@ -15,13 +16,18 @@ function route(moved: boolean): void {
   const { signal } = leaving;
   const path = location.hash.replace(/^#/, "") || "/";
   const job = /^\/jobs\/([0-9a-f]{32})$/.exec(path)?.[1];
+  const batch = /^\/batches\/([\w.-]+)$/.exec(path)?.[1];
   document.title = "SMSR";
   let page = "jobs";
   if (job) replace(main, jobView(job, signal));
+  else if (batch) replace(main, batchView(batch, signal));
   else if (path === "/jobs") replace(main, jobsView(signal));
   else if (path === "/") {
     page = "new";
-    replace(main, h("div", { class: "home" }, submitView(signal), jobsView(signal, true)));
+    replace(
+      main,
+      h("div", { class: "home" }, submitView(signal), jobsView(signal, { short: true })),
+    );
   } else {
     page = "";
     replace(main, h("p", {}, "There is nothing here. ", h("a", { href: "#/" }, "To the start")));
@@ -72,6 +78,16 @@ function askForKey(): void {
   input.focus();
 }
 
+/** Say that the service does not answer, and look whether it does again. */
+function showConnection(): void {
+  const place = document.getElementById("away")!;
+  place.hidden = !connection.lost;
+  if (!connection.lost) return;
+  replace(place, "The service does not answer. This page goes on as soon as it does.");
+  const again = () => void ask("v1/info").catch(() => setTimeout(again, 3000));
+  setTimeout(again, 3000);
+}
+
 function showVersion(): void {
   void info().then(
     ({ version }) => {
@@ -82,6 +98,7 @@ function showVersion(): void {
 }
 
 onKeyWanted.add(askForKey);
+connection.onchange.add(showConnection);
 addEventListener("hashchange", () => route(true));
 document.querySelector(".skip")!.addEventListener("click", (event) => {
   event.preventDefault(); // its address would be a route

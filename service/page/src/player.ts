@@ -1,7 +1,7 @@
 /** Time: which frame is shown, and how it goes on by itself. */
 
 /** Frames in a second at the speed 1. */
-export const FRAME_RATE = 25;
+const FRAME_RATE = 25;
 
 export class Player {
   /** Position in frames; between two of them while playing. */

@@ -9,7 +9,7 @@ export function problemPanel(problem: Problem): HTMLElement {
     "div",
     { class: "problem", role: "alert" },
     h("h3", {}, problem.title),
-    problem.detail ? h("p", {}, problem.detail) : null,
+    problem.detail ? h("p", {}, marked(problem.detail)) : null,
   );
   const slug = /^\/problems\/([a-z0-9-]+)$/.exec(problem.type)?.[1];
   if (slug) {
@@ -24,14 +24,22 @@ export function problemPanel(problem: Problem): HTMLElement {
       ),
     );
     void remedyOf(problem).then((text) => {
-      if (text) append(remedy, h("strong", {}, "What helps: "), text);
+      if (text) append(remedy, h("strong", {}, "What helps: "), marked(text));
     });
   }
   return panel;
 }
 
+/** Names between backticks, as code. */
+const marked = (text: string): (string | HTMLElement)[] =>
+  text.split("`").map((part, i) => (i % 2 ? h("code", {}, part) : part));
+
 /** The panel of anything that was thrown. */
 export function errorPanel(error: unknown): HTMLElement {
+  // The form that asks for the key says the rest.
+  if (error instanceof Refused && error.problem.status === 401) {
+    return h("p", { class: "empty" }, "To be seen with an API key.");
+  }
   if (error instanceof Refused) return problemPanel(error.problem);
   const detail = error instanceof Error ? error.message : String(error);
   return problemPanel({ type: "about:blank", title: "That did not work", status: 0, detail });

@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
-import { guessRoles } from "../src/data/roles";
+import { guessRoles, misfit, type Role } from "../src/data/roles";
 import { readTable } from "../src/data/text";
-import { tracksOf } from "../src/data/tracks";
+import { growsUp, tracksOf } from "../src/data/tracks";
 import { EventParser } from "../src/events";
 import { ticks, viridis } from "../src/viewer/colours";
 import { plan, spread } from "../src/viewer/result";
@@ -43,9 +43,32 @@ describe("roles of files", () => {
     ]);
   });
 
-  it("are each given once", () => {
-    const two = [1, 2].map((i) => ({ name: `w${i}.npy`, inspected: looked([20, 2, 9]) }));
-    expect(guessRoles(two).filter((role) => role === "measurements")).toHaveLength(1);
+  it("are each given once, but for measurements", () => {
+    const given = (shape: number[], dtype: string) =>
+      guessRoles([1, 2].map((i) => ({ name: `x${i}.npy`, inspected: looked(shape, dtype) })));
+    expect(given([20, 2, 9], "<f4")).toEqual(["measurements", "measurements"]);
+    expect(given([21, 3], "<i4").filter((role) => role === "faces")).toHaveLength(1);
+    expect(given([20, 3, 9], "<f4").filter((role) => role === "ground_truth")).toHaveLength(1);
+  });
+
+  it("tell a matrix of true shapes from that of its tracks", () => {
+    const files = [180, 120].map((rows) => ({ name: "x.npy", inspected: looked([rows, 50]) }));
+    expect(guessRoles(files)).toEqual(["ground_truth", "measurements"]);
+  });
+
+  it.each([
+    ["measurements", [121, 50], /2T/],
+    ["measurements", [4, 50], /At least 3 frames/],
+    ["ground_truth", [60, 49, 3], /T = 60 and N = 50/],
+    ["faces", [3, 100], /\(F, 3\)/],
+    ["measurements", [60, 2, 50], null],
+    ["ground_truth", [180, 50], null],
+    ["ground_truth", [60, 3, 50], null],
+    ["faces", [100, 3], null],
+  ] as [Role, number[], RegExp | null][])("%s of shape %j", (role, shape, wrong) => {
+    const found = misfit(role, shape, [60, 50]);
+    if (wrong) expect(found).toMatch(wrong);
+    else expect(found).toBeNull();
   });
 });
 
@@ -86,6 +109,13 @@ describe("tracks", () => {
     expect(of([3, 2, 4], interleaved)).toEqual(expected);
     expect(of([3, 4, 2], last)).toEqual(expected);
     expect(tracksOf({ shape: [5, 4], dtype: "<f8", data: last })).toBeNull();
+  });
+
+  it("are pixels where the first frame has no negative coordinates", () => {
+    const up = (...data: number[]) =>
+      growsUp(tracksOf({ shape: [4, 2], dtype: "<f8", data: Float64Array.from(data) })!);
+    expect(up(0, 5, 3, Number.NaN, -1, -1, -1, -1)).toBe(false);
+    expect(up(0, 5, 3, -0.1, 1, 1, 1, 1)).toBe(true);
   });
 });
 

@@ -97,7 +97,7 @@ function eigenSymmetric(A: Matrix3): { values: number[]; vectors: Matrix3 } {
 }
 
 /** Find entry (frame, point, axis) of ground truth; null where the array has another extent. */
-export function truthIndex(
+function truthIndex(
   shape: number[],
   frames: number,
   points: number,

@@ -5,14 +5,16 @@ import { HEADER_BYTES, isNpy, type NumberArray, parseHeader, readNpy, Unreadable
 import { readTable } from "./text";
 
 /** Larger files are sent without a look inside: a page must not take a gigabyte of memory. */
-export const LARGEST_NPY = 512e6;
-export const LARGEST_TEXT = 64e6;
+const LARGEST_NPY = 512e6;
+const LARGEST_TEXT = 64e6;
 
 /** A file that was looked at. */
 export interface Inspected {
   shape: number[] | null;
   dtype: string | null;
   array: NumberArray | null;
+  /** Part of the numbers that are none (NaN). */
+  unseen?: number;
   /** Why the numbers are not shown, where they are not. */
   note: string | null;
 }
@@ -28,14 +30,13 @@ export async function inspect(file: Blob, name: string): Promise<Inspected> {
       if (file.size > LARGEST_NPY) {
         return { shape, dtype, array: null, note: "Too large to be shown before it is sent." };
       }
-      return { shape, dtype, array: readNpy(await contentOf(file)), note: null };
+      return seen(readNpy(await contentOf(file)));
     }
     if (/\.(csv|txt)(\.gz)?$/i.test(name)) {
       if (file.size > LARGEST_TEXT) {
         return { ...nothing, note: `Tables above ${size(LARGEST_TEXT)} are not shown before.` };
       }
-      const array = readTable(await textOf(file, name));
-      return { shape: array.shape, dtype: "text", array, note: null };
+      return seen(readTable(await textOf(file, name)));
     }
     const kind = /\.(npz|mat)$/i.exec(name)?.[1].toLowerCase();
     if (kind) {
@@ -46,11 +47,21 @@ export async function inspect(file: Blob, name: string): Promise<Inspected> {
           "and everything else works as ever.",
       };
     }
-    return { ...nothing, note: "This page does not know the format; the service will judge it." };
+    const unlike = /\.npy$/i.test(name)
+      ? "This is no NPY file, whatever its name says"
+      : "This page does not know the format";
+    return { ...nothing, note: `${unlike}; the service will judge it.` };
   } catch (error) {
     const reason = error instanceof Unreadable ? error.message : "The file cannot be read here.";
     return { ...nothing, note: reason };
   }
+}
+
+function seen(array: NumberArray): Inspected {
+  let lacking = 0;
+  for (const value of array.data) if (Number.isNaN(value)) lacking += 1;
+  const { shape, dtype, data } = array;
+  return { shape, dtype, array, unseen: lacking / Math.max(data.length, 1), note: null };
 }
 
 const contentOf = async (file: Blob): Promise<Uint8Array> =>

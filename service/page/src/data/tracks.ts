@@ -59,7 +59,13 @@ export function tracksOf(array: NumberArray, layout: Layout = "auto"): Tracks | 
   return { frames, points, total, positions, bounds: boundsOf(positions) };
 }
 
-export function boundsOf(positions: Float32Array): Tracks["bounds"] {
+/** Whether v seems to grow upwards: a frame with negative coordinates is none of pixels. */
+export function growsUp({ positions, points }: Tracks): boolean {
+  for (let i = 0; i < 2 * points; i += 1) if (positions[i] < 0) return true;
+  return false;
+}
+
+function boundsOf(positions: Float32Array): Tracks["bounds"] {
   const bounds = { left: Infinity, right: -Infinity, top: Infinity, bottom: -Infinity };
   for (let i = 0; i < positions.length; i += 2) {
     const u = positions[i];

@@ -9,6 +9,7 @@ const MOST_WHILE_PLAYING = 2000;
 
 export class TrackView {
   private frame = 0;
+  private upward = false;
   private tracks: Tracks | null = null;
   private readonly context: CanvasRenderingContext2D;
   private readonly watcher: ResizeObserver;
@@ -24,8 +25,10 @@ export class TrackView {
     this.watcher.observe(canvas);
   }
 
-  show(tracks: Tracks | null): void {
+  /** @param upward - whether the second coordinate grows upwards, other than that of pixels */
+  show(tracks: Tracks | null, upward: boolean): void {
     this.tracks = tracks;
+    this.upward = upward;
     this.draw();
   }
 
@@ -48,7 +51,9 @@ export class TrackView {
     const margin = 0.06 * Math.min(canvas.width, canvas.height);
     const scale = Math.min((canvas.width - 2 * margin) / wide, (canvas.height - 2 * margin) / high);
     const x0 = (canvas.width - wide * scale) / 2 - bounds.left * scale;
-    const y0 = (canvas.height - high * scale) / 2 - bounds.top * scale;
+    const turn = this.upward ? -scale : scale;
+    const first = this.upward ? bounds.bottom : bounds.top;
+    const y0 = (canvas.height - high * scale) / 2 - first * turn;
     const style = getComputedStyle(canvas);
     const frame = Math.min(Math.max(Math.round(this.frame), 0), tracks.frames - 1);
 
@@ -66,7 +71,7 @@ export class TrackView {
           continue;
         }
         const x = x0 + u * scale;
-        const y = y0 + positions[at + 1] * scale;
+        const y = y0 + positions[at + 1] * turn;
         if (pen) context.lineTo(x, y);
         else context.moveTo(x, y);
         pen = true;
@@ -84,7 +89,7 @@ export class TrackView {
       if (!Number.isNaN(u)) {
         context.fillRect(
           x0 + u * scale - size / 2,
-          y0 + positions[at + 1] * scale - size / 2,
+          y0 + positions[at + 1] * turn - size / 2,
           size,
           size,
         );

@@ -6,9 +6,9 @@ import { HEADER_BYTES, type NumberArray, parseHeader, readNpy } from "../data/np
 import { type Tracks, tracksOf } from "../data/tracks";
 
 /** Bytes of positions that are held, here and once more on the graphics card. */
-export const MOST_HELD = 256e6;
+const MOST_HELD = 256e6;
 /** Bytes of shapes that are fetched; of longer ones every other frame, or fewer. */
-export const MOST_FETCHED = 1.2e9;
+const MOST_FETCHED = 1.2e9;
 
 /** Which frames and points of a result are shown. */
 export interface Plan {

@@ -137,6 +137,10 @@ export class Scene {
   private readonly mesh: Mesh<BufferGeometry, ShaderMaterial>;
   private readonly truthPoints: Points<BufferGeometry, ShaderMaterial>;
   private readonly path = new Group();
+  private readonly line = new Line(
+    new BufferGeometry(),
+    new LineBasicMaterial({ color: 0x8fa3b8 }),
+  );
   private readonly marker = new LineSegments(
     new BufferGeometry(),
     new LineBasicMaterial({ color: 0xffb454 }),
@@ -144,6 +148,8 @@ export class Scene {
   private readonly frames: Stored[] = [];
   private faces: Uint32Array | null = null;
   private rotations: Float64Array[] = [];
+  /** Sign with which the image's second axis points up, and the third of a camera to the viewer. */
+  private upward: 1 | -1 = -1;
   private radius = 1;
   private moved = false;
   private asked = 0;
@@ -212,8 +218,8 @@ export class Scene {
         side: 2,
       }),
     );
-    this.path.add(this.marker);
-    for (const part of [this.points, this.truthPoints, this.mesh, this.marker]) {
+    this.path.add(this.line, this.marker);
+    for (const part of [this.points, this.truthPoints, this.mesh, this.line, this.marker]) {
       part.frustumCulled = false;
     }
     this.world.add(this.points, this.truthPoints, this.mesh, this.path);
@@ -233,23 +239,29 @@ export class Scene {
   /** Say where the cameras of the tracks are: (T, 2, 3), of which the shown frames are taken. */
   setCameras(cameras: ArrayLike<number>, frameNumbers: ArrayLike<number>): void {
     this.rotations = Array.from(frameNumbers, (t) => rotationOf(cameras, t));
+  }
+
+  /** Say whether the second coordinate of the image grows upwards, other than that of pixels. */
+  setUpward(upward: boolean): void {
+    this.upward = upward ? 1 : -1;
     // Columns that the mean camera has as its right, up and back become x, y and z.
     const mean = Array.from({ length: 9 }, (_, i) =>
       this.rotations.reduce((sum, R) => sum + R[i], 0),
     );
     let right = new Vector3(mean[0], mean[1], mean[2]);
-    let down = new Vector3(mean[3], mean[4], mean[5]);
-    if (Math.min(right.length(), down.length()) < 0.35 * this.rotations.length) {
+    let up = new Vector3(mean[3], mean[4], mean[5]);
+    if (Math.min(right.length(), up.length()) < 0.35 * this.rotations.length) {
       const R = this.rotations[0]; // the camera goes all the way round: there is no mean
       right = new Vector3(R[0], R[1], R[2]);
-      down = new Vector3(R[3], R[4], R[5]);
+      up = new Vector3(R[3], R[4], R[5]);
     }
     right.normalize();
-    down.addScaledVector(right, -down.dot(right)).normalize();
-    const forward = new Vector3().crossVectors(right, down);
+    up.addScaledVector(right, -up.dot(right)).normalize().multiplyScalar(this.upward);
+    const back = new Vector3().crossVectors(right, up);
     this.world.quaternion.setFromRotationMatrix(
-      new Matrix4().makeBasis(right, down.clone().negate(), forward.clone().negate()).transpose(),
+      new Matrix4().makeBasis(right, up, back).transpose(),
     );
+    if (this.frames.length) this.complete();
     this.ask();
   }
 
@@ -271,7 +283,7 @@ export class Scene {
     if (!this.moved) this.resetView();
     this.ranges.depth = this.rangeOf((k, i, X) => {
       const R = this.rotations[k];
-      return R[6] * X[i] + R[7] * X[i + 1] + R[8] * X[i + 2];
+      return this.upward * (R[6] * X[i] + R[7] * X[i + 1] + R[8] * X[i + 2]);
     });
     const motion = this.rangeOf(
       (k, i, X) =>
@@ -419,7 +431,7 @@ export class Scene {
     uniforms.mode.value = MODES[colouring];
     uniforms.range.value.set(...this.ranges[colouring]);
     const R = this.rotations[low];
-    if (R) uniforms.depthAxis.value.set(R[6], R[7], R[8]);
+    if (R) uniforms.depthAxis.value.set(R[6], R[7], R[8]).multiplyScalar(this.upward);
     uniforms.pointSize.value = this.look.pointSize * this.renderer.getPixelRatio();
     uniforms.radius.value = this.radius;
   }
@@ -467,10 +479,12 @@ export class Scene {
   }
 
   private followCamera(low: number, high: number, blend: number): void {
-    const [, down, forward] = this.rotationAt(low, high, blend);
+    const [, v, third] = this.rotationAt(low, high, blend);
     const turn = this.world.quaternion;
-    this.camera.up.copy(down.negate().applyQuaternion(turn));
-    this.camera.position.copy(forward.multiplyScalar(-this.fitting()).applyQuaternion(turn));
+    this.camera.up.copy(v.multiplyScalar(this.upward).applyQuaternion(turn));
+    this.camera.position.copy(
+      third.multiplyScalar(this.upward * this.fitting()).applyQuaternion(turn),
+    );
     this.camera.lookAt(0, 0, 0);
     this.camera.up.set(0, 1, 0);
   }
@@ -478,28 +492,25 @@ export class Scene {
   /** Draw where the cameras were; made once, when first wanted. */
   private makePath(): void {
     const distance = PATH_RADII * this.radius;
-    const spots = this.rotations.flatMap((R) => [6, 7, 8].map((i) => -R[i] * distance));
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(spots), 3));
-    const line = new Line(geometry, new LineBasicMaterial({ color: 0x8fa3b8 }));
-    line.frustumCulled = false;
-    this.path.add(line);
+    const spots = this.rotations.flatMap((R) => [6, 7, 8].map((i) => R[i] * distance));
+    this.line.geometry.setAttribute("position", new BufferAttribute(Float32Array.from(spots), 3));
     this.marker.geometry.setAttribute("position", new BufferAttribute(new Float32Array(48), 3));
   }
 
   /** The image plane of the frame that is shown, and lines from its corners along the view. */
   private placeMarker(low: number, high: number, blend: number): void {
     if (!this.marker.geometry.attributes.position) this.makePath();
-    const [right, down, forward] = this.rotationAt(low, high, blend);
-    const middle = forward.clone().multiplyScalar(-PATH_RADII * this.radius);
+    this.line.scale.setScalar(this.upward);
+    const [right, v, third] = this.rotationAt(low, high, blend);
+    const middle = third.clone().multiplyScalar(this.upward * PATH_RADII * this.radius);
     const half = 0.22 * this.radius;
     const corner = (a: number, b: number) =>
       middle
         .clone()
         .addScaledVector(right, a * half * 1.3)
-        .addScaledVector(down, b * half);
+        .addScaledVector(v, b * half);
     const corners = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
-    const eye = middle.clone().addScaledVector(forward, -0.5 * half);
+    const eye = middle.clone().addScaledVector(third, this.upward * 0.5 * half);
     const lines = corners.flatMap((c, i) => [c, corners[(i + 1) % 4], c, eye]);
     const target = this.marker.geometry.attributes.position as BufferAttribute;
     for (const [i, spot] of lines.entries()) target.setXYZ(i, spot.x, spot.y, spot.z);
@@ -580,7 +591,7 @@ const distance = (X: Float32Array, Y: Float32Array, i: number): number =>
   Math.hypot(X[i] - Y[i], X[i + 1] - Y[i + 1], X[i + 2] - Y[i + 2]);
 
 /** Area-weighted normals of the points as (K, 4) signed bytes; the fourth is padding. */
-export function normalsOf(positions: Float32Array, faces: Uint32Array): Int8Array {
+function normalsOf(positions: Float32Array, faces: Uint32Array): Int8Array {
   const sums = new Float32Array(positions.length);
   for (let f = 0; f < faces.length; f += 3) {
     const [a, b, c] = [3 * faces[f], 3 * faces[f + 1], 3 * faces[f + 2]];

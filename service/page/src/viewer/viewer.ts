@@ -3,7 +3,7 @@
 import type { Job, Metrics } from "../api";
 import { alignTruth } from "../data/alignment";
 import type { Tracks } from "../data/tracks";
-import { type Layout, tracksOf } from "../data/tracks";
+import { growsUp, type Layout, tracksOf } from "../data/tracks";
 import { TrackView } from "../data/trackview";
 import { append, h, icon, reducedMotion, replace, say, svg } from "../dom";
 import { bytes, count, significant } from "../format";
@@ -20,11 +20,14 @@ const COLOURINGS: Record<Colouring, string> = {
   plain: "One colour",
 };
 const LEGENDS: Record<Colouring, string> = {
-  depth: "Depth from the camera, in the unit of the tracks",
-  motion: "3D motion in a frame, in the unit of the tracks",
-  error: "Distance from the ground truth, in σ (as e3D)",
+  depth: "Depth towards the camera (unit of the tracks)",
+  motion: "3D motion in a frame (unit of the tracks)",
+  error: "Distance from the ground truth (σ, as e3D)",
   plain: "",
 };
+
+/** Points that any browser draws fast enough. */
+const FEW = 10_000;
 
 const KEYS: [string, string][] = [
   ["Space", "play or pause"],
@@ -86,9 +89,14 @@ class Viewer {
   private readonly triangulateRow: HTMLElement;
   private readonly truthBox = h("input", { type: "checkbox", id: "truth" });
   private readonly truthRow: HTMLElement;
+  private readonly wholeBox = h("input", { type: "checkbox", id: "whole" });
+  private readonly wholeRow: HTMLElement;
+  private readonly upBox = h("input", { type: "checkbox", id: "up" });
   private plan: Plan | null = null;
   private readonly shapes: Float32Array[] = [];
   private cameras: ArrayLike<number> = [];
+  private translations: ArrayLike<number> = [];
+  private tracks: Tracks | null = null;
   private sigma = 1;
   private errors: number[] | null = null;
   private facesGiven: Uint32Array | null = null;
@@ -105,6 +113,7 @@ class Viewer {
       "no faces sent",
     );
     this.truthRow = this.check(this.truthBox, "Overlay ground truth", "orange points");
+    this.wholeRow = this.check(this.wholeBox, "All points, however slow");
     this.element = this.build();
     try {
       this.scene = new Scene(this.canvas);
@@ -168,10 +177,9 @@ class Viewer {
       this.restyle({ follow: follow.checked });
       if (!follow.checked) this.scene?.resetView();
     });
-    const whole = h("input", { type: "checkbox", id: "whole" });
-    whole.addEventListener("change", () => this.restyle({ whole: whole.checked }));
     this.triangulateRow.hidden = true;
     this.truthRow.hidden = true;
+    this.wholeRow.hidden = true;
     const keys = h(
       "details",
       { class: "keys" },
@@ -243,7 +251,8 @@ class Viewer {
           this.truthRow,
           this.check(path, "Camera path"),
           this.check(follow, "See as the camera"),
-          this.check(whole, "All points, however slow"),
+          this.check(this.upBox, "Image v grows upwards"),
+          this.wholeRow,
         ),
         keys,
       ),
@@ -271,6 +280,8 @@ class Viewer {
     this.meshBox.addEventListener("change", () => this.restyle({ mesh: this.meshBox.checked }));
     this.triangulateBox.addEventListener("change", () => void this.triangulate());
     this.truthBox.addEventListener("change", () => this.restyle({ truth: this.truthBox.checked }));
+    this.upBox.addEventListener("change", () => this.setUpward(scene, this.upBox.checked));
+    this.wholeBox.addEventListener("change", () => this.restyle({ whole: this.wholeBox.checked }));
     this.player.onchange = () => this.follow();
     scene.onmeasure = () => this.showRate();
     document.addEventListener("keydown", (event) => this.onkey(event), { signal: this.signal });
@@ -343,7 +354,7 @@ class Viewer {
     const unit = colouring === "error" ? this.sigma : 1;
     const [low, high] = this.scene!.range(colouring).map((value) => value / unit);
     const marks = ticks(low, high).map((value) => {
-      const mark = h("span", { class: "tick" }, significant(value, 4));
+      const mark = h("span", { class: "tick" }, significant(value, 4).replace("-", "−"));
       mark.style.left = `${(100 * (value - low)) / (high - low || 1)}%`;
       return mark;
     });
@@ -373,6 +384,7 @@ class Viewer {
       fetchArray(job.links.translations!, signal),
     ]);
     this.cameras = cameras.data;
+    this.translations = translations.data;
     for await (const part of fetchShapes(job, signal)) {
       if (part instanceof Float32Array) this.take(part, scene);
       else this.begin(part, scene);
@@ -383,7 +395,7 @@ class Viewer {
     this.drawLegend();
     this.element.dataset.loaded = "true";
     if (!reducedMotion()) this.player.play();
-    await this.loadTracks(translations.data);
+    await this.loadTracks();
     await this.loadFaces();
     await this.loadTruth(scene);
     this.element.dataset.complete = "true";
@@ -401,6 +413,7 @@ class Viewer {
       this.decimation = `Shows ${parts.join(" and ")} of this large result (${size}).`;
       this.tell(this.decimation);
     }
+    this.wholeRow.hidden = shown < FEW;
     const suggested = shown < 120 ? 9 : shown < 2500 ? 6 : shown < 25_000 ? 3 : 2;
     scene.look.pointSize = suggested;
     if (this.sizeInput) this.sizeInput.value = String(suggested);
@@ -408,6 +421,7 @@ class Viewer {
 
   private take(positions: Float32Array, scene: Scene): void {
     this.shapes.push(positions);
+    if (this.shapes.length === 1) this.setUpward(scene, growsUp(this.projected()));
     scene.addFrame(positions);
     this.player.frames = this.shapes.length;
     this.slider.max = String(this.shapes.length - 1);
@@ -415,7 +429,20 @@ class Viewer {
     if (this.shapes.length === 1) this.follow();
   }
 
-  private async loadTracks(translations: ArrayLike<number>): Promise<void> {
+  /** Turn both views so that they stand upright. */
+  private setUpward(scene: Scene, upward: boolean): void {
+    this.upBox.checked = upward;
+    this.element.dataset.imageV = upward ? "up" : "down";
+    scene.setUpward(upward);
+    this.trackView.show(this.tracks, upward);
+    this.drawLegend();
+  }
+
+  private projected(): Tracks {
+    return projected(this.shapes, this.plan!.frameNumbers, this.cameras, this.translations);
+  }
+
+  private async loadTracks(): Promise<void> {
     const sent = await fetchInput(this.job, "measurements", this.signal);
     let tracks: Tracks | null = null;
     if (typeof sent !== "string") {
@@ -424,12 +451,13 @@ class Viewer {
       if (tracks && this.plan!.stride > 1) tracks = null;
     }
     if (!tracks) {
-      const { shapes, plan } = this;
-      tracks = projected(shapes, plan!.frameNumbers, this.cameras, translations);
+      tracks = this.projected();
       this.trackTitle.textContent = "Result, projected to the image";
       this.trackTitle.title = typeof sent === "string" ? sent : "";
     }
-    if (!this.signal.aborted) this.trackView.show(tracks);
+    if (this.signal.aborted) return;
+    this.tracks = tracks;
+    this.trackView.show(tracks, this.upBox.checked);
   }
 
   private async loadFaces(): Promise<void> {

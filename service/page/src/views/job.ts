@@ -1,11 +1,12 @@
 /** One job: its progress, what went wrong, or its result. */
 
-import { address, isActive, type Job, save } from "../api";
+import { isActive, type Job, save } from "../api";
 import { h, icon, replace, say } from "../dom";
 import { followJob } from "../events";
 import { bytes, count, exact, label, precise, seconds, sentence, significant } from "../format";
 import { errorPanel, problemPanel } from "../problem";
-import { actions, badge, title } from "./parts";
+import { figuresCard } from "./figures";
+import { actions, badge, batchLink, facts, title } from "./parts";
 
 export function jobView(id: string, signal: AbortSignal): HTMLElement {
   return new JobView(id, signal).element;
@@ -85,21 +86,26 @@ class JobView {
   private drawHead(job: Job): void {
     const held = document.activeElement?.closest(".job-head") ? document.activeElement : null;
     const name = held?.getAttribute("title");
-    const facts = [
+    const parts = [
       job.frames && job.points
         ? `${count(job.frames)} frames of ${count(job.points)} points`
         : null,
       `sent ${exact(job.created_at)}`,
       job.timings.total !== undefined ? `took ${seconds(job.timings.total)}` : null,
       job.attempt > 1 ? `attempt ${job.attempt}` : null,
-    ].filter((fact) => fact !== null);
+    ].filter((part) => part !== null);
     replace(
       this.head,
       h(
         "div",
         {},
         h("h1", {}, title(job), " ", badge(job)),
-        h("p", { class: "facts" }, facts.join(" · ")),
+        h(
+          "p",
+          { class: "facts" },
+          parts.join(" · "),
+          job.batch ? [" · batch ", batchLink(job.batch)] : null,
+        ),
       ),
       h(
         "div",
@@ -223,17 +229,15 @@ function ended(job: Job, signal: AbortSignal, fail: (error: unknown) => void): N
       : h("span", { hidden: true }),
     place,
     h("div", { class: "cards" }, accuracyCard(job), downloadsCard(job, fail), optionsCard(job)),
+    job.links.figure
+      ? figuresCard(
+          () => `${job.links.figure}?image_v=${viewed("imageV") ?? "auto"}`,
+          stemOf(job),
+          job.metrics !== null,
+          signal,
+        )
+      : h("span", { hidden: true }),
   ];
-}
-
-function facts(entries: [string, string | null | undefined][]): HTMLElement {
-  return h(
-    "dl",
-    { class: "facts-list" },
-    entries
-      .filter(([, value]) => value !== null && value !== undefined)
-      .map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))),
-  );
 }
 
 function accuracyCard(job: Job): HTMLElement {
@@ -261,25 +265,34 @@ function accuracyCard(job: Job): HTMLElement {
   );
 }
 
-function downloadsCard(job: Job, fail: (error: unknown) => void): HTMLElement {
-  const { links } = job;
-  const stem = title(job)
+/** What the viewer shows: the number of the frame, or where the image's v grows to. */
+const viewed = (what: "frame" | "imageV"): string | undefined =>
+  document.querySelector<HTMLElement>(".viewer")?.dataset[what];
+
+/** Name of a job in names of files. */
+const stemOf = (job: Job): string =>
+  title(job)
     .replace(/\.(npy|npz|mat|csv|txt)(\.gz)?$/i, "")
     .replace(/\W+/g, "-");
-  const button = (path: string, name: string, text: string, help: string) => {
+
+function downloadsCard(job: Job, fail: (error: unknown) => void): HTMLElement {
+  const { links } = job;
+  const stem = stemOf(job);
+  const button = (path: string | (() => string), name: string, text: string, help: string) => {
     const element = h(
       "button",
       { type: "button", class: "download", "data-file": name },
       icon("down"),
       h("span", {}, text, h("small", {}, help)),
     );
-    element.addEventListener("click", () => void save(path, name).catch(fail));
+    const find = typeof path === "string" ? () => path : path;
+    element.addEventListener("click", () => void save(find(), name).catch(fail));
     return element;
   };
   const frame = h("button", { type: "button", class: "download", "data-file": "frame" });
   replace(frame, icon("down"), h("span", {}, "PLY", h("small", {}, "the frame that is shown")));
   frame.addEventListener("click", () => {
-    const t = document.querySelector<HTMLElement>(".viewer")?.dataset.frame ?? "0";
+    const t = viewed("frame") ?? "0";
     void save(links.frame!.replace("{t}", t), `${stem}-frame-${t.padStart(4, "0")}.ply`).catch(
       fail,
     );
@@ -296,7 +309,12 @@ function downloadsCard(job: Job, fail: (error: unknown) => void): HTMLElement {
       links.frames ? button(links.frames, `${stem}-frames.zip`, "ZIP", "all frames as PLY") : null,
       links.frame ? frame : null,
       links.glb
-        ? button(links.glb, `${stem}.glb`, "GLB", "animated, for Blender and others")
+        ? button(
+            () => `${links.glb}?image_v=${viewed("imageV") ?? "auto"}`,
+            `${stem}.glb`,
+            "GLB",
+            "animated, for Blender and others",
+          )
         : null,
       links.report
         ? button(links.report, `${stem}-report.json`, "Report", "how it came about")
@@ -305,7 +323,15 @@ function downloadsCard(job: Job, fail: (error: unknown) => void): HTMLElement {
     h(
       "p",
       { class: "help" },
-      h("a", { href: address(links.self!) }, "This job as JSON"),
+      h(
+        "button",
+        {
+          type: "button",
+          class: "link",
+          onclick: () => void save(links.self!, `${stem}-job.json`).catch(fail),
+        },
+        "This job as JSON",
+      ),
       job.expires_at ? ` · kept until ${exact(job.expires_at)}` : "",
     ),
   );

@@ -1,16 +1,27 @@
 /** The list of jobs, kept up to date while it is open. */
 
-import { isActive, type Job, listJobs } from "../api";
+import { type Batch, isActive, type Job, listBatches, listJobs } from "../api";
 import { append, h, replace } from "../dom";
 import { followJobs } from "../events";
 import { ago, count, exact, precise } from "../format";
 import { errorPanel } from "../problem";
-import { actions, badge, title } from "./parts";
+import { actions, badge, batchLink, title } from "./parts";
 
 const PAGE = 50;
 
-/** @param short - only the newest, without a filter, beside the form of a new job. */
-export function jobsView(signal: AbortSignal, short = false): HTMLElement {
+interface Choice {
+  /** Only the newest, without a filter, beside the form of a new job. */
+  short?: boolean;
+  /** Only the jobs of a batch. */
+  batch?: string;
+  /** Called when jobs may have changed. */
+  onchange?: () => void;
+}
+
+export function jobsView(
+  signal: AbortSignal,
+  { short = false, batch, onchange = () => {} }: Choice = {},
+): HTMLElement {
   const jobs = new Map<string, Job>();
   let next: string | null = null;
   const rows = h("tbody", {});
@@ -29,7 +40,8 @@ export function jobsView(signal: AbortSignal, short = false): HTMLElement {
     append(filter, h("option", { value }, text));
   }
 
-  const fits = (job: Job) => !filter.value || job.status === filter.value;
+  const fits = (job: Job) =>
+    (!filter.value || job.status === filter.value) && (!batch || job.batch === batch);
   const draw = () => {
     const shown = [...jobs.values()]
       .filter(fits)
@@ -69,7 +81,12 @@ export function jobsView(signal: AbortSignal, short = false): HTMLElement {
     return h(
       "tr",
       { "data-id": job.id },
-      h("td", { class: "job-name" }, h("a", { href: `#/jobs/${job.id}` }, title(job))),
+      h(
+        "td",
+        { class: "job-name" },
+        h("a", { href: `#/jobs/${job.id}` }, title(job)),
+        job.batch && !batch ? batchLink(job.batch) : null,
+      ),
       h("td", { "data-label": "Status" }, badge(job)),
       h("td", { "data-label": "Frames × points", class: "number" }, extent),
       h("td", { "data-label": "e3D", class: "number" }, e3d),
@@ -113,9 +130,15 @@ export function jobsView(signal: AbortSignal, short = false): HTMLElement {
     }
   };
   const refresh = () => {
+    onchange();
     const status = filter.value ? `&status=${filter.value}` : "";
-    return load(`v1/jobs?limit=${short ? 8 : PAGE}${status}`, true);
+    const only = batch ? `&batch=${batch}` : "";
+    return load(`v1/jobs?limit=${short ? 8 : PAGE}${status}${only}`, true);
   };
+  const batchList = h("p", { class: "batch-list", hidden: true });
+  if (!short && !batch) {
+    void listBatches(signal).then(({ batches }) => showBatches(batchList, batches), fail);
+  }
   filter.addEventListener("change", () => void refresh());
   more.addEventListener("click", () => next && void load(next, false));
   void refresh();
@@ -125,10 +148,12 @@ export function jobsView(signal: AbortSignal, short = false): HTMLElement {
       job: (job) => {
         jobs.set(job.id, job);
         draw();
+        onchange();
       },
       deleted: (id) => {
         jobs.delete(id);
         draw();
+        onchange();
       },
     },
     signal,
@@ -144,12 +169,13 @@ export function jobsView(signal: AbortSignal, short = false): HTMLElement {
     h(
       "div",
       { class: "row heading" },
-      h(short ? "h2" : "h1", { id: "jobs-title" }, short ? "Recent jobs" : "Jobs"),
+      h(short || batch ? "h2" : "h1", { id: "jobs-title" }, short ? "Recent jobs" : "Jobs"),
       short
         ? h("a", { href: "#/jobs" }, "All jobs")
         : h("label", { class: "field", for: "status" }, h("span", {}, "Show"), filter),
     ),
     problems,
+    batchList,
     h(
       "table",
       {},
@@ -169,5 +195,14 @@ export function jobsView(signal: AbortSignal, short = false): HTMLElement {
     ),
     empty,
     more,
+  );
+}
+
+function showBatches(place: HTMLElement, batches: Batch[]): void {
+  place.hidden = !batches.length;
+  replace(
+    place,
+    "Batches: ",
+    batches.map(({ label, total }) => h("span", {}, batchLink(label), ` ${count(total)}`)),
   );
 }

@@ -3,7 +3,7 @@
 import { isActive, type Job, post, remove, type Status } from "../api";
 import { h, icon } from "../dom";
 
-const STATUS_NAMES: Record<Status, string> = {
+export const STATUS_NAMES: Record<Status, string> = {
   queued: "Queued",
   running: "Running",
   succeeded: "Done",
@@ -25,6 +25,21 @@ export function badge(job: Job): HTMLElement {
 }
 
 export const title = (job: Job): string => job.name ?? `Job ${job.id.slice(0, 8)}`;
+
+/** Names and values; what has no value is left out. */
+export function facts(entries: [string, string | null | undefined][]): HTMLElement {
+  return h(
+    "dl",
+    { class: "facts-list" },
+    entries
+      .filter(([, value]) => value !== null && value !== undefined)
+      .map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))),
+  );
+}
+
+/** The label of a job's batch, which leads to it. */
+export const batchLink = (label: string): HTMLElement =>
+  h("a", { class: "batch-link", href: `#/batches/${label}` }, label);
 
 /** Buttons for what can be done with a job; `failed` gets what went wrong, `gone` a deletion. */
 export function actions(
@@ -58,21 +73,21 @@ export function actions(
     buttons.push(element);
   };
   if (job.links.cancel && !job.cancel_requested) {
-    button("Cancel", "close", async () => on.changed(await post(job.links.cancel!)));
+    button("Cancel", "close", async () => on.changed(await post<Job>(job.links.cancel!)));
   }
   if (job.links.retry) {
-    button("Run again", "retry", async () => on.changed(await post(job.links.retry!)));
+    button("Run again", "retry", async () => on.changed(await post<Job>(job.links.retry!)));
   }
   button("Delete", "bin", async () => {
     if (!(await confirmed(`Delete ${title(job)} and its files?`))) return;
-    await remove(job);
+    await remove(job.links.self!);
     on.gone();
   });
   return buttons;
 }
 
 /** Ask before what cannot be undone. */
-function confirmed(question: string): Promise<boolean> {
+export function confirmed(question: string): Promise<boolean> {
   return new Promise((resolve) => {
     const keep = h("button", { value: "keep" }, "Keep it");
     const dialog = h(

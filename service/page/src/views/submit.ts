@@ -1,16 +1,17 @@
 /** A new job: files, a look at them, options, and off. */
 
-import { info, type Job, submit } from "../api";
+import { connection, info, type Job } from "../api";
 import { exampleFiles } from "../data/example";
 import { type Inspected, inspect } from "../data/files";
-import { guessRoles, ROLE_NAMES, ROLES, type Role } from "../data/roles";
-import { extentOf, type Layout, tracksOf } from "../data/tracks";
+import { guessRoles, misfit, ROLE_NAMES, ROLES, type Role } from "../data/roles";
+import { extentOf, growsUp, type Layout, tracksOf } from "../data/tracks";
 import { TrackView } from "../data/trackview";
 import { append, h, icon, reducedMotion, replace, say } from "../dom";
-import { bytes, count } from "../format";
+import { bytes, count, significant } from "../format";
 import { type OptionForm, optionForm } from "../options";
 import { Player } from "../player";
 import { errorPanel } from "../problem";
+import { submit } from "../upload";
 
 interface Chosen {
   file: File;
@@ -26,17 +27,29 @@ class SubmitView {
   readonly element: HTMLElement;
   private chosen: Chosen[] = [];
   private form: OptionForm | null = null;
+  /** Bytes that the service takes at once. */
+  private most = Infinity;
   private readonly input = h("input", {
     type: "file",
     multiple: true,
     id: "files",
     class: "only-heard",
-    accept: ".npy,.npz,.mat,.csv,.txt,.gz",
   });
   private readonly drop: HTMLElement;
   private readonly list = h("ul", { class: "files", "aria-label": "Chosen files" });
   private readonly preview = h("div", { class: "preview", hidden: true });
+  private readonly previewNote = h("p", { class: "note", role: "status" });
+  private readonly caption = h("figcaption", {});
   private readonly optionArea = h("div", {});
+  private readonly batch = h("input", {
+    type: "text",
+    id: "batch",
+    pattern: "[A-Za-z0-9][A-Za-z0-9._\\-]{0,63}",
+    autocomplete: "off",
+    "aria-describedby": "batch-help",
+  });
+  private readonly priority = h("select", { id: "priority", "aria-describedby": "priority-help" });
+  private readonly settings = this.settingsForm();
   private readonly problems = h("div", { class: "problems" });
   private readonly send = h("button", { type: "submit", class: "primary", disabled: true });
   private readonly sending = h("div", { class: "sending", hidden: true });
@@ -60,9 +73,9 @@ class SubmitView {
       this.list,
       this.preview,
       this.optionArea,
+      this.settings,
       this.problems,
-      h("div", { class: "send-row" }, this.send, this.hint),
-      this.sending,
+      h("div", { class: "send-row" }, this.send, this.hint, this.sending),
     );
     this.element.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -74,15 +87,60 @@ class SubmitView {
     });
     this.buildPreview();
     this.update();
-    void info()
-      .then((known) => {
-        this.form = optionForm(known.options);
-        this.form.onchange = (name) => {
-          if (name === "layout") this.showPreview();
-        };
-        replace(this.optionArea, h("h2", {}, "Options"), this.form.element);
-      })
-      .catch((error) => replace(this.problems, errorPanel(error)));
+    const again = () => {
+      if (!connection.lost && !this.form) void this.loadOptions();
+    };
+    connection.onchange.add(again);
+    signal.addEventListener("abort", () => connection.onchange.delete(again));
+    void this.loadOptions();
+  }
+
+  private async loadOptions(): Promise<void> {
+    try {
+      const known = await info();
+      this.problems.replaceChildren();
+      this.most = known.limits.upload_bytes;
+      this.input.accept = known.formats.measurements.map((name) => `.${name}`).join(",");
+      this.form = optionForm(known.options);
+      this.form.onchange = (name) => {
+        if (name === "layout") this.showPreview();
+        if (name === "missing") this.warn();
+      };
+      replace(this.optionArea, h("h2", {}, "Options"), this.form.element);
+      if (this.chosen.length) this.update();
+    } catch (error) {
+      replace(this.problems, errorPanel(error));
+    }
+  }
+
+  private settingsForm(): HTMLDetailsElement {
+    for (const value of ["high", "normal", "low"]) {
+      append(this.priority, h("option", { value, selected: value === "normal" }, value));
+    }
+    const field = (name: string, control: HTMLElement, help: string) =>
+      h(
+        "div",
+        { class: "option" },
+        h("label", { for: control.id }, name),
+        control,
+        h("p", { class: "help", id: `${control.id}-help` }, help),
+      );
+    return h(
+      "details",
+      {},
+      h("summary", {}, "Batch and priority"),
+      h(
+        "div",
+        { class: "option-grid" },
+        field(
+          "Batch",
+          this.batch,
+          "A label that jobs share, to be followed, cancelled, run again or downloaded together: " +
+            "letters, digits, dots, dashes.",
+        ),
+        field("Priority", this.priority, "Jobs of a higher priority are run first."),
+      ),
+    );
   }
 
   private dropZone(): HTMLElement {
@@ -179,25 +237,46 @@ class SubmitView {
     const hint = this.obstacle();
     this.send.disabled = hint !== null;
     this.hint.textContent = hint ?? this.summary();
+    if (this.measured().length > 1) this.settings.open = true;
     this.showPreview();
+  }
+
+  private measured(): Chosen[] {
+    return this.chosen.filter((c) => c.role === "measurements");
   }
 
   private obstacle(): string | null {
     if (!this.chosen.length) return "Choose a file with tracks first.";
-    const roles = this.chosen.map((c) => c.role).filter((role) => role !== null);
-    if (!roles.includes("measurements")) return "One of the files must be the measurements.";
-    if (new Set(roles).size < roles.length) return "Two files have the same role.";
+    const number = (role: Role) => this.chosen.filter((c) => c.role === role).length;
+    if (!number("measurements")) return "One of the files must be the measurements.";
+    if (number("ground_truth") > 1 || number("faces") > 1) return "Two files have the same role.";
+    if (number("measurements") > 1 && number("ground_truth")) {
+      return "With ground truth, send one file of measurements at a time.";
+    }
+    const rest = sizeOf(this.chosen.filter((c) => c.role && c.role !== "measurements"));
+    if (this.measured().some((c) => rest + c.file.size > this.most)) {
+      return `That is more than the service takes at once (${bytes(this.most)}).`;
+    }
     return null;
   }
 
   private summary(): string {
     const sent = this.chosen.filter((c) => c.role);
-    const size = sent.reduce((sum, c) => sum + c.file.size, 0);
-    return `${sent.length === 1 ? "1 file" : `${sent.length} files`}, ${bytes(size)}`;
+    const jobs = this.measured().length;
+    const files = `${sent.length === 1 ? "1 file" : `${sent.length} files`}, ${bytes(sizeOf(sent))}`;
+    return jobs > 1 ? `${files}: ${jobs} jobs` : files;
   }
 
   private row(chosen: Chosen): HTMLElement {
     const { file, inspected, role } = chosen;
+    const { shape } = inspected;
+    const first = this.measured()[0]?.inspected.shape;
+    const tracks = first ? extentOf(first) : null;
+    let { note } = inspected;
+    if (!note && shape && role) note = misfit(role, shape, tracks);
+    else if (!note && shape && ROLES.every((other) => misfit(other, shape, tracks))) {
+      note = "Its shape is that of no tracks, ground truth or faces.";
+    }
     const select = h("select", { "aria-label": `What ${file.name} is` });
     for (const value of ROLES) {
       append(select, h("option", { value, selected: value === role }, ROLE_NAMES[value]));
@@ -230,7 +309,7 @@ class SubmitView {
       ),
       select,
       drop,
-      inspected.note ? h("p", { class: "note" }, inspected.note) : null,
+      note ? h("p", { class: "note" }, note) : null,
     );
   }
 
@@ -254,26 +333,44 @@ class SubmitView {
     };
     append(
       this.preview,
-      h("figure", { class: "stage stage-2d" }, this.canvas),
+      h("figure", { class: "stage stage-2d" }, this.canvas, this.caption),
       h("div", { class: "transport" }, button, h("div", { class: "timeline" }, slider), text),
+      this.previewNote,
     );
   }
 
   private showPreview(): void {
-    const measured = this.chosen.find((c) => c.role === "measurements");
+    const measured: Chosen | undefined = this.measured()[0];
     const array = measured?.inspected.array;
     const layout = this.form?.values().layout as Layout | undefined;
     const tracks = array ? tracksOf(array, layout) : null;
     this.preview.hidden = tracks === null;
-    this.trackView.show(tracks);
+    this.trackView.show(tracks, tracks !== null && growsUp(tracks));
     if (!tracks) {
       this.player.pause();
       return;
     }
+    const parts = this.measured().length > 1 ? [measured.file.name] : [];
+    if (tracks.points < tracks.total) {
+      parts.push(`${count(tracks.points)} of ${count(tracks.total)} points`);
+    }
+    this.caption.textContent = parts.join(" · ");
+    this.warn();
     this.player.frames = tracks.frames;
     this.player.time = Math.min(this.player.time, tracks.frames - 1);
     this.player.onchange();
     if (!reducedMotion()) this.player.play();
+  }
+
+  /** Say what will make the job fail, as far as it is to be seen here. */
+  private warn(): void {
+    const most = Math.max(0, ...this.measured().map((c) => c.inspected.unseen ?? 0));
+    const refused = (this.form?.values().missing ?? "refuse") === "refuse";
+    const part = most < 0.001 ? "Less than 0.1" : significant(100 * most, 2);
+    this.previewNote.textContent =
+      most && refused
+        ? `${part} % of the positions are not seen (NaN): the option Missing must be "complete".`
+        : "";
   }
 
   private async start(): Promise<void> {
@@ -284,31 +381,50 @@ class SubmitView {
     const cancel = h("button", { type: "button", onclick: () => stop.abort() }, "Stop");
     replace(this.sending, bar, text, cancel);
     this.sending.hidden = false;
+    this.hint.hidden = true;
     this.send.disabled = true;
     this.problems.replaceChildren();
     say("Sending");
     const files: Partial<Record<Role, File>> = {};
     for (const { file, role } of this.chosen) if (role) files[role] = file;
+    const settings: Record<string, string> = { priority: this.priority.value };
+    if (this.batch.value) settings.batch = this.batch.value;
+    const measured = this.measured();
     try {
-      const job: Job = await submit(
-        files,
-        this.form?.values() ?? {},
-        (fraction) => {
-          bar.value = fraction;
-          text.textContent = fraction < 1 ? `${Math.round(100 * fraction)} %` : "Being checked…";
-        },
-        stop.signal,
-      );
-      location.hash = `#/jobs/${job.id}`;
+      let last: Job | null = null;
+      for (const [i, chosen] of measured.entries()) {
+        last = await submit({
+          files: { ...files, measurements: chosen.file },
+          options: this.form?.values() ?? {},
+          settings,
+          progress: (fraction) => {
+            bar.value = (i + fraction) / measured.length;
+            text.textContent = fraction < 1 ? `${Math.round(100 * bar.value)} %` : "Being checked…";
+          },
+          signal: stop.signal,
+        });
+        // What is sent is not sent again where a later file is refused.
+        if (measured.length > 1) this.chosen = this.chosen.filter((other) => other !== chosen);
+      }
+      if (this.signal.aborted) return say("Sent"); // who left meanwhile is not fetched back
+      if (measured.length === 1) location.hash = `#/jobs/${last!.id}`;
+      else location.hash = settings.batch ? `#/batches/${settings.batch}` : "#/jobs";
     } catch (error) {
+      this.update();
       if ((error as Error).name === "AbortError") say("The upload was stopped");
-      else replace(this.problems, errorPanel(error));
+      else {
+        replace(this.problems, errorPanel(error));
+        this.problems.scrollIntoView({ block: "nearest" });
+      }
     } finally {
       this.sending.hidden = true;
+      this.hint.hidden = false;
       this.send.disabled = this.obstacle() !== null;
     }
   }
 }
+
+const sizeOf = (files: Chosen[]): number => files.reduce((sum, c) => sum + c.file.size, 0);
 
 function described({ file, inspected, role }: Chosen): string {
   const parts = [bytes(file.size)];
