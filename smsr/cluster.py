@@ -87,10 +87,10 @@ class DaskSource:
                 yield part, here[:, part.start - points.start : part.stop - points.start]
 
     def triangles(
-        self, shift: NDArray[np.float64], size: int, step: int, workers: int | None
+        self, shift: NDArray[np.float64], size: int, sampled: NDArray[np.intp], workers: int | None
     ) -> Iterator[tuple[int, Triangle]]:
-        """Reduce blocks of about `size` points where they are, and keep every n-th point."""
-        return self.map(partial(triangle_of, shift=shift, step=step), size, workers)
+        """Reduce blocks of about `size` points where they are, and keep a sample."""
+        return self.map(partial(triangle_of, shift=shift, sampled=sampled), size, workers)
 
     def map(
         self, work: Callable[[slice, NDArray[Any]], Result], size: int, workers: int | None

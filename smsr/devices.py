@@ -16,7 +16,7 @@ import numpy as np
 from smsr.errors import NotNumeric
 from smsr.progress import ignore
 from smsr.sinks import sink_for
-from smsr.triangles import NotUsableError, Triangle, every_nth
+from smsr.triangles import NotUsableError, Triangle, within
 
 if TYPE_CHECKING:
     import os
@@ -69,10 +69,10 @@ class DeviceSource:
         self,
         shift: NDArray[np.float64],
         size: int,
-        step: int,
+        sampled: NDArray[np.intp],
         workers: int | None,  # noqa: ARG002
     ) -> Iterator[tuple[int, Triangle]]:
-        """Reduce blocks of `size` points and keep every n-th; see `smsr.streaming.map_chunks`.
+        """Reduce blocks of `size` points and keep a sample; see `smsr.streaming.map_chunks`.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class DeviceSource:
         """
         origin = self._put(shift[:, None])
         for points in self._slices(size):
-            yield points.stop, self._triangle(points, origin, every_nth(points, step))
+            yield points.stop, self._triangle(points, origin, within(points, sampled))
 
     def map_back(
         self,
@@ -136,7 +136,7 @@ class DeviceSource:
     def _centred(self, points: slice, origin: Any) -> Any:
         return self._library.astype(self._block(points), self._library.float64) - origin
 
-    def _triangle(self, points: slice, origin: Any, sampled: slice) -> Triangle:
+    def _triangle(self, points: slice, origin: Any, sampled: NDArray[np.intp]) -> Triangle:
         """Reduce a block by a Householder QR."""
         xp = self._library
         centred = self._centred(points, origin)
@@ -147,7 +147,8 @@ class DeviceSource:
         rows = xp.permute_dims(centred - means, (1, 0))
         if rows.shape[0] > rows.shape[1]:
             rows = xp.linalg.qr(rows, mode="reduced")[1]
-        sample = _to_host(centred[:, sampled])
+        where = xp.asarray(sampled, device=compat.device(self.tracks))
+        sample = _to_host(xp.take(centred, where, axis=1))
         return Triangle(points.stop - points.start, mean, _to_host(rows), sample)
 
     def _shapes(self, points: slice, origin: Any, factors: list[Any], lift: Any) -> Any:

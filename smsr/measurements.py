@@ -105,9 +105,9 @@ class RemoteSource(MeasurementSource, Protocol):
         ...
 
     def triangles(
-        self, shift: NDArray[np.float64], size: int, step: int, workers: int | None
+        self, shift: NDArray[np.float64], size: int, sampled: NDArray[np.intp], workers: int | None
     ) -> Iterator[tuple[int, Triangle]]:
-        """Reduce blocks of about `size` points, and keep every n-th point.
+        """Reduce blocks of about `size` points, and keep a sample of them.
 
         Yields the end of each block and its triangle.
         """

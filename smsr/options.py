@@ -87,8 +87,8 @@ class Options:
         "auto",
         "How cameras are found: 'relaxed' by convex problems, 'uniform' as a turn of constant "
         "velocity, 'paper' by rank-3 thresholding. 'auto' is 'paper' in that preset; otherwise "
-        "the relaxed cameras, or a simple path of the camera where that explains them; for a "
-        "rigid object they come from its factorisation.",
+        "the relaxed cameras, less the drift that points at rest show, or a simple path of the "
+        "camera where that explains them; for a rigid object they come from its factorisation.",
     )
     basis_size: int | None = option(
         None,

@@ -67,7 +67,7 @@ class RowSpace:
     frames, points : int
         T and N.
     sample : ndarray of shape (2T, s), float64
-        Some points of the centred W, evenly spread: at most `SAMPLE`.
+        Some points of the centred W, chosen blindly: `SAMPLE`, or all where they are fewer.
     """
 
     means: NDArray[np.float64]
@@ -127,16 +127,16 @@ def factorise(
     # Differences to a point of the data are exact or nearly so: a far translation is gone before
     # anything is added or multiplied, and costs no digits.
     size = _factor_chunk(source, chunk_bytes)
-    step = -(-source.points // SAMPLE)
+    sampled = _sample(source.points)
     triangles: Iterator[tuple[int, Triangle]]
     if isinstance(source, RemoteSource):
         shift = source.first_point().astype(np.float64)
-        triangles = source.triangles(shift, size, step, workers)
+        triangles = source.triangles(shift, size, sampled, workers)
     else:
         chunks = checked_chunks(source, size)
         first = next(chunks)
         shift = first[1][:, 0].astype(np.float64)
-        work = partial(triangle_of, shift=shift, step=step)
+        work = partial(triangle_of, shift=shift, sampled=sampled)
         triangles = map_chunks(work, chain([first], chunks), workers or blas_threads())
     waiting: list[Triangle] = []
     try:
@@ -149,6 +149,13 @@ def factorise(
         check_values(source)
         raise _too_large() from None
     return _row_space(merged(waiting), shift, source)
+
+
+def _sample(points: int) -> NDArray[np.intp]:
+    """Return numbers of some points: the same in each run, but in step with no grid."""
+    if points <= SAMPLE:
+        return np.arange(points)
+    return np.sort(np.random.default_rng(0).choice(points, SAMPLE, replace=False, shuffle=False))
 
 
 def _factor_chunk(source: MeasurementSource, chunk_bytes: int) -> int:

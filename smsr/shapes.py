@@ -221,7 +221,9 @@ class DepthProblem:
     def minimise(self, max_iterations: int, tolerance: float, hook: StageHook = ignore) -> bool:
         """Iterate from the present state; return whether both residuals met the tolerance."""
         if self.penalty == 0.0:
-            self.penalty = self.FIRST_PENALTY / max(float(self.spectrum()[0]), np.finfo(float).tiny)
+            size = 1e-9 * float(np.linalg.norm(self.shapes))
+            largest = max(float(self.spectrum()[0]), size, np.finfo(float).tiny)
+            self.penalty = self.FIRST_PENALTY / largest
         S, Y = self.shapes, self.dual
         Z = S
         factor = self._banded_factor(self.penalty, self.motion_weight)
@@ -295,7 +297,8 @@ def estimate_shapes(
         See `smsr.progress.StageHook`.
     """
     share = simpler_share * _trust(noise)
-    if simpler is not None and share == 1.0:
+    blended = options.shape_method == "auto" and share < 1.0
+    if simpler is not None and simpler_share == 1.0 and not blended:
         found = estimate_shapes(
             measurements,
             simpler,

@@ -53,14 +53,19 @@ class Triangle:
     sample: NDArray[np.float64]
 
 
-def every_nth(points: slice, step: int) -> slice:
-    """Return where in a block of points those stand whose number is a multiple of `step`."""
-    count = points.stop - points.start
-    return slice(min(-points.start % step, count), count, step)
+def within(points: slice, sampled: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return where in a block of points those of a sample stand, both in their order."""
+    first, last = np.searchsorted(sampled, [points.start, points.stop])
+    inside: NDArray[np.intp] = sampled[first:last] - points.start
+    return inside
 
 
 def triangle_of(
-    points: slice, block: NDArray[Any], *, shift: NDArray[np.float64], step: int
+    points: slice,
+    block: NDArray[Any],
+    *,
+    shift: NDArray[np.float64],
+    sampled: NDArray[np.intp],
 ) -> Triangle:
     """Reduce a block of points.
 
@@ -72,8 +77,8 @@ def triangle_of(
         Of any real type; converted to double precision part by part.
     shift : ndarray of shape (2T,)
         What the coordinates are taken relative to.
-    step : int
-        Points whose number is a multiple of this are kept as they are, too.
+    sampled : ndarray of int
+        Numbers of the points, in their order, that are kept as they are, too.
 
     Raises
     ------
@@ -87,7 +92,7 @@ def triangle_of(
         if triangle is None:
             triangle = _triangle_by_householder(block, shift)
         return dataclasses.replace(
-            triangle, sample=block[:, every_nth(points, step)] - shift[:, None]
+            triangle, sample=block[:, within(points, sampled)] - shift[:, None]
         )
 
 

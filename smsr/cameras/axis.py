@@ -83,7 +83,7 @@ def smooth_tilt(tilt: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _anisotropy(vectors: NDArray[np.float64]) -> float:
-    """Return the largest part of two that one of the two leading directions has."""
+    """Return how far vectors (T, 3) lie along one direction: 0.5 for a plane, 1 for a line."""
     values = np.linalg.eigvalsh(vectors.T @ vectors)
     return float(values[2] / max(values[2] + values[1], np.finfo(float).tiny))
 

@@ -42,8 +42,8 @@ class CameraEstimate:
     coherent : bool
         Whether a simple path of the camera made the object move no more.
     simpler : ndarray of shape (T, 3, 3), optional
-        The free cameras that gave way to others. Shapes are simpler for them, as they turn with the
-        object.
+        The free cameras, where `rotations` follow a path or a resting frame instead. They turn with
+        the object, so its shapes are simpler to them.
     simpler_share : float
         How much of the depths that they see is to be taken, 0 to 1.
     """

@@ -14,7 +14,7 @@ import numpy as np
 
 from smsr import rotations as so3
 from smsr.cameras.axis import fit_axis, smooth_tilt
-from smsr.cameras.paces import fit_swing, polynomials, robust_fit
+from smsr.cameras.paces import fit_swing, polynomials, robust_fit, score
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,15 +43,13 @@ class GimbalFit:
     axis: AxisFit
 
 
-def fit_gimbal(rotations: NDArray[np.float64], score: Callable[[float, int], float]) -> GimbalFit:
+def fit_gimbal(rotations: NDArray[np.float64]) -> GimbalFit:
     """Fit a turn about an axis with a steady or a swinging nod to cameras.
 
     Parameters
     ----------
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
-    score : callable
-        Information criterion of a mean square and a number of parameters.
     """
     time = np.linspace(-1.0, 1.0, len(rotations), dtype=np.float64)
     functions: tuple[tuple[Callable[[NDArray[np.float64]], NDArray[np.float64]], int], ...] = (

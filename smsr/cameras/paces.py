@@ -6,6 +6,7 @@ turn. A camera that is led by a machine, or by a steady hand, follows a function
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,9 +16,16 @@ from numpy.polynomial.legendre import legvander
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+COST_OF_A_PARAMETER = 0.55
+"""By how much one parameter more has to lower the log of what is left unexplained."""
+
+FLOOR = 0.02
+"""Radians; what follows the cameras more closely than this is not better for it."""
+
 _ROUNDS = 8
 _OUTLIER = 2.0  # of the residual's spread
 _CYCLES = np.arange(0.4, 8.0, 0.05)  # of a swing, over the whole sequence
+_FEWEST_PER_CYCLE = 4.0  # frames
 _FINER = np.linspace(-0.05, 0.05, 21)
 _FRAMES = 400  # as many tell the frequency of a swing
 
@@ -39,6 +47,11 @@ class Pace:
     name: str
     angles: NDArray[np.float64]
     parameters: int
+
+
+def score(unexplained: float, parameters: int) -> float:
+    """Return an information criterion of a mean square: what has the lowest is most likely."""
+    return math.log(unexplained + FLOOR**2) + COST_OF_A_PARAMETER * parameters
 
 
 def fit_paces(angles: NDArray[np.float64]) -> list[Pace]:
@@ -91,6 +104,7 @@ def fit_swing(
     def rest_of_most(cycles: float) -> float:
         return float(np.abs(some - robust_fit(basis(some_time, cycles), some)).sum())
 
-    cycles = min(_CYCLES.tolist(), key=rest)
+    most = max(_CYCLES[0], len(angles) / _FEWEST_PER_CYCLE)
+    cycles = min(_CYCLES[most >= _CYCLES].tolist(), key=rest)
     cycles = min((cycles + _FINER).tolist(), key=rest_of_most)
     return robust_fit(basis(time, cycles), angles)

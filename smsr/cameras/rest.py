@@ -22,6 +22,7 @@ _ROUNDS = 60
 _NEAR = 0.02  # of the object's size; what moves less is at rest
 _QUIET_PART = 0.1  # of the points
 _RESTING = (0.16, 0.22)
+_LINE = 1e-3  # second singular value over the first of a mean shape that can be turned about itself
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +34,7 @@ class Rest:
     turns : ndarray of shape (T, 3, 3)
         Q; the shapes at rest are ``Q_t S_t``.
     unrest : float
-        How far the quietest tenth of the points moves, relative to all.
+        How far the quietest tenth of the points moves, relative to all; 1 for points on a line.
     """
 
     turns: NDArray[np.float64]
@@ -73,6 +74,9 @@ def resting_frame(shapes: NDArray[np.float64]) -> Rest:
         squares = ((turned - mean) ** 2).sum(axis=1, keepdims=True)
         weights = (squares + near) ** (_POWER / 2.0 - 1.0)
         weights /= weights.mean()
+    spread = np.linalg.svd(mean - mean.mean(axis=1, keepdims=True), compute_uv=False)
+    if spread[1] <= _LINE * spread[0]:
+        return Rest(turns, 1.0)
     moved = np.sqrt(squares.mean(axis=(0, 1)))
     overall = max(float(np.sqrt((moved**2).mean())), np.finfo(float).tiny)
     return Rest(turns, float(np.quantile(moved, _QUIET_PART)) / overall)

@@ -16,17 +16,18 @@ import numpy as np
 from smsr.cameras.free import every_frame, free_cameras
 from smsr.cameras.paper import published_cameras
 from smsr.cameras.rigid import RIGID_REST, rigid_cameras
-from smsr.cameras.trial import Path, Trial
+from smsr.cameras.trial import Trial
 from smsr.cameras.turn import refine_velocity
-from smsr.cameras.uniform import fit_uniform_turn
 from smsr.progress import ignore, part_of
 from smsr.shapes import by_turn_speed
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from smsr.cameras.estimate import CameraEstimate
-    from smsr.cameras.trial import Verdict
+    from smsr.cameras.trial import Path, Verdict
     from smsr.cameras.turn import Turn
     from smsr.options import Options
     from smsr.progress import StageHook
@@ -133,10 +134,11 @@ def with_uniform_path(
         As for `with_simple_path`.
     """
     trial = _trial(free, measurements)
-    path = Path("uniform", fit_uniform_turn(free.rotations))
+    path = trial.uniform()
     verdict = trial.measure(path)
     turn = _refined(path, verdict, trial, hook)
-    return _on_path(free, path, turn, verdict, dict(free.criteria))
+    estimate = _on_path(free, path, turn, verdict, dict(free.criteria) | _numbers(path, verdict))
+    return dataclasses.replace(estimate, simpler=None, simpler_share=0.0)
 
 
 def with_simple_path(
@@ -175,31 +177,40 @@ def with_simple_path(
         return free
     trial = _trial(free, measurements)
     criteria = dict(free.criteria)
-    still = free
+    still, reasons = free, []
     if points is not None:
         criteria["unrest"], trust = trial.come_to_rest(points[:_DIRECTIONS])
         if trust > 0.0:
             still = dataclasses.replace(
                 free, rotations=trial.rotations, simpler=free.rotations, simpler_share=1.0
             )
+            reasons.append(f"turned to where points rest, by {trust:.0%} of the way")
     limit = max(SPAN_LIMIT, part_outside_span(measurements, free.rotations))
-    refusals = []
-    for path in trial.paths():
+    paths = trial.paths()
+    if not paths:
+        reasons.append("the cameras keep to no axis")
+    for path in paths:
         verdict = trial.judge(path)
-        criteria[f"{path.model}_unexplained"] = verdict.unexplained
-        if verdict.motion_rise is not None:
-            criteria[f"{path.model}_motion_rise"] = verdict.motion_rise
+        criteria |= _numbers(path, verdict)
         if verdict.motion_weight is None:
-            refusals.append(f"{path} {verdict.reason}")
+            reasons.append(f"{path} {verdict.reason}")
             continue
         turn = path.turn if path.is_loose else _refined(path, verdict, trial, hook)
         outside = part_outside_span(measurements, turn.rotations)
-        criteria[f"{path.model}_outside_span"] = outside
+        criteria[f"{path.name}_outside_span"] = outside
         if outside > limit and not denoised:
-            refusals.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
+            reasons.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
             continue
         return _on_path(free, path, turn, verdict, criteria)
-    return dataclasses.replace(still, criteria=criteria, reason="; ".join([*refusals, free.reason]))
+    return dataclasses.replace(still, criteria=criteria, reason="; ".join([*reasons, free.reason]))
+
+
+def _numbers(path: Path, verdict: Verdict) -> dict[str, float]:
+    """Return what a path was judged by, as criteria."""
+    numbers = {f"{path.name}_unexplained": verdict.unexplained}
+    if verdict.motion_rise is not None:
+        numbers[f"{path.name}_motion_rise"] = verdict.motion_rise
+    return numbers
 
 
 def _refined(path: Path, verdict: Verdict, trial: Trial, hook: StageHook) -> Turn:
@@ -222,13 +233,20 @@ def _refined(path: Path, verdict: Verdict, trial: Trial, hook: StageHook) -> Tur
 
 
 def _on_path(
-    free: CameraEstimate, path: Path, turn: Turn, verdict: Verdict, criteria: dict[str, float]
+    free: CameraEstimate,
+    path: Path,
+    turn: Turn,
+    verdict: Verdict,
+    criteria: Mapping[str, float],
 ) -> CameraEstimate:
     """Return the cameras of an accepted path."""
     low, high = SIMPLER
     share = min(max((high - verdict.simplicity) / (high - low), 0.0), 1.0)
-    certain = path.is_certain and by_turn_speed(turn.rotations, 0.0, 1.0)
-    least = 1.0 if path.is_loose else LEAST_SHARE * (1.0 - certain)
+    least = LEAST_SHARE
+    if path.is_loose:
+        least = 1.0
+    elif path.is_certain:
+        least = by_turn_speed(turn.rotations, LEAST_SHARE, 0.0)
     speed = math.degrees(float(np.linalg.norm(turn.velocity)))
     return dataclasses.replace(
         free,
@@ -238,7 +256,7 @@ def _on_path(
         coherent=not path.is_loose and (verdict.motion_rise or 0.0) <= COHERENT_RISE,
         simpler=free.rotations,
         simpler_share=max(share, least),
-        reason=f"{path} of {speed:.2f} degrees a frame {verdict.reason}; {free.reason}",
+        reason=f"{path}, {speed:.2f} degrees a frame, {verdict.reason}; {free.reason}",
     )
 
 

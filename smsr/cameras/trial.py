@@ -1,7 +1,7 @@
 """Simple paths of the camera on trial: whether one may take the place of free cameras.
 
 A path is taken where it passes four tests: it is the simplest that fits, it leaves little of the
-free cameras unexplained, the shapes it gives do not move more, and it lies in the span of the
+free cameras unexplained, the shapes it gives do not move much more, and it lies in the span of the
 tracks (`smsr.cameras.selection`).
 """
 
@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from smsr import rotations as so3
 from smsr.cameras.axis import fit_axis
 from smsr.cameras.gimbal import fit_gimbal
-from smsr.cameras.paces import fit_paces
+from smsr.cameras.paces import fit_paces, score
 from smsr.cameras.rest import resting_frame
 from smsr.cameras.switched import fit_switched_turn
 from smsr.cameras.turn import with_shake
@@ -39,11 +39,8 @@ UNEXPLAINED_LITTLE = 0.035
 MOTION_RISE_LIMIT = 0.35
 """By how much more: log of the ratio of ||D S#||^2."""
 
-COST_OF_A_PARAMETER = 0.55
-"""By how much one parameter more has to lower the log of what a path leaves unexplained."""
-
-FLOOR = 0.02
-"""Radians; a path that follows the free cameras more closely than this is not better for it."""
+NODDING_LIMITS = (0.02, 0.16)
+"""The same two limits for a path with a nod, which fits much that it should not."""
 
 _FREE_ANGLES = 6  # as many parameters as a turn counts that goes on in any way about one axis
 _MOTION_WEIGHT = 1.5
@@ -104,11 +101,6 @@ class Path:
             "swinging": "a swing",
         }.get(self.name, f"a {self.name} turn")
         return f"{turn} with a nod" if self.nods else turn
-
-
-def score(unexplained: float, parameters: int) -> float:
-    """Return an information criterion: the path of the lowest is the most likely one."""
-    return math.log(unexplained + FLOOR**2) + COST_OF_A_PARAMETER * parameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,22 +178,29 @@ class Trial:
         rest = resting_frame(self._free.shapes.reshape(self._free.frames, 3, -1) @ points)
         if rest.trust > 0.0:
             # Drift is slow. What changes fast are errors, which would be taken for a shake.
-            turns = so3.log(rest.turns @ so3.mean_rotation(rest.turns).T)
+            turns = so3.log(so3.mean_rotation(rest.turns).T @ rest.turns)
             turns = gaussian_filter1d(turns, _REST_SMOOTHING / self.step, axis=0, mode="nearest")
             frames = np.arange(len(self.rotations))
             every = np.stack([np.interp(frames, frames[:: self.step], x) for x in turns.T], axis=1)
             self.rotations = self.rotations @ so3.exp(-rest.trust * every)
         return rest.unrest, rest.trust
 
+    def uniform(self) -> Path:
+        """Return the uniform turn nearest to the free cameras, without any shake."""
+        turn = fit_uniform_turn(self.rotations)
+        drift = so3.angles_between(turn.rotations, self.rotations)
+        return Path("uniform", turn, unexplained=float((drift**2).mean()))
+
     def paths(self) -> list[Path]:
         """Return the most likely path, and as the next one any turn about the same axis.
 
-        There is none where the cameras do not keep to an axis, nodding or not.
+        There is none where the cameras do not keep to an axis. Where they nod meanwhile, the turn
+        has to be one that can be named: the two together could be much.
         """
         axis, nod = fit_axis(self.rotations), None
         steady = self.rotations
         if not axis.is_followed():
-            gimbal = fit_gimbal(self.rotations, score)
+            gimbal = fit_gimbal(self.rotations)
             axis, nod = gimbal.axis, gimbal.nod
             steady = so3.exp(-nod) @ self.rotations
             if not axis.is_followed():
@@ -220,23 +219,33 @@ class Trial:
             for path in [*found, Path("axis", axis.turn(), _FREE_ANGLES)]
         )
         best = min(found, key=lambda path: path.score)
+        if nod is not None:
+            return [best]
         return [best, anyhow] if best.score < anyhow.score else [anyhow]
+
+    def _unexplained(self, path: Path) -> float:
+        """Return which part of the rotation variance of the free cameras a path leaves."""
+        spread = ((self.rotations - self.rotations.mean(axis=0)) ** 2).sum(axis=(1, 2)).mean()
+        # ||G - H||_F^2 is twice the squared angle between G and H, to second order.
+        return 2.0 * path.unexplained / max(float(spread), np.finfo(float).tiny)
 
     def judge(self, path: Path) -> Verdict:
         """Put a path to the tests."""
-        spread = ((self.rotations - self.rotations.mean(axis=0)) ** 2).sum(axis=(1, 2)).mean()
-        # ||G - H||_F^2 is twice the squared angle between G and H, to second order.
-        unexplained = 2.0 * path.unexplained / max(float(spread), np.finfo(float).tiny)
-        if unexplained > UNEXPLAINED_LIMIT:
+        unexplained = self._unexplained(path)
+        most = NODDING_LIMITS[0] if path.nods else UNEXPLAINED_LIMIT
+        if unexplained > most:
             return Verdict(unexplained, f"leaves {unexplained:.1%} of the rotation unexplained")
-        verdict = self.measure(path, unexplained)
-        rise = verdict.motion_rise or 0.0
-        if rise <= (MOTION_RISE_LIMIT if unexplained <= UNEXPLAINED_LITTLE else 0.0):
+        verdict = self.measure(path)
+        little, rise = (UNEXPLAINED_LITTLE, MOTION_RISE_LIMIT)
+        if path.nods:
+            little, rise = NODDING_LIMITS
+        if (verdict.motion_rise or 0.0) <= (rise if unexplained <= little else 0.0):
             return verdict
         return dataclasses.replace(verdict, motion_weight=None)
 
-    def measure(self, path: Path, unexplained: float = 0.0) -> Verdict:
+    def measure(self, path: Path) -> Verdict:
         """Compare the shapes that a path gives with those of the free cameras, and accept it."""
+        unexplained = self._unexplained(path)
         tiny = np.finfo(float).tiny
         problem = self._solve(path.turn.every(self.step).rotations)
         motion = max(problem.motion(), tiny)

@@ -15,6 +15,7 @@ from smsr.cameras import estimate_cameras, fix_gauge
 from smsr.errors import Cancelled, InvalidOption, UnknownOption
 from smsr.options import Options, resolve
 from smsr.pipeline import STAGES
+from smsr.rotations import complete
 from smsr.shapes import estimate_shapes
 from smsr.synthetic import make_example, make_low_rank
 
@@ -202,6 +203,54 @@ class TestInvariance:
             reconstruct(tracks.transpose(0, 2, 1)),
         ):
             np.testing.assert_allclose(same.shapes, plain.shapes, atol=1e-9)
+
+
+def test_noise_alone_is_reconstructed_too() -> None:
+    for seed, frames, points in ((60, 14, 6), (206, 17, 6), (3, 20, 8)):
+        W = np.random.default_rng(seed).standard_normal((2 * frames, points))
+        for model in ("auto", "uniform"):
+            assert_valid(reconstruct(W, camera_model=model, noise=0.0), W)
+            assert np.isfinite(reconstruct(W, camera_model=model).shapes).all()
+
+
+def test_on_a_grid_points_at_rest_are_found_whatever_their_order() -> None:
+    """A sample in step with the rows of a grid of pixels would see one column of it."""
+    side, frames = 64, 50
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-1.0, 1.0, side)]))
+    time = np.linspace(0.0, 1.0, frames)
+    shape = np.stack([x, y, 0.8 * np.cos(1.5 * x) * np.cos(1.2 * y) + 0.3 * np.sin(4.0 * x)])
+    left_part = np.clip((0.2 - x) / 0.15, 0.0, 1.0)
+    twist = np.stack([0.3 * y, -0.3 * (x + 0.6), 0.5 * np.sin(2.0 * y)]) * left_part
+    wave = np.stack([0.2 * np.sin(3.0 * y), 0.2 * np.cos(3.0 * x), 0.3 * np.cos(3.0 * y + x)])
+    motion = np.sin(6.0 * time)[:, None, None] * 1.2 * twist
+    motion = motion + np.sin(3.0 * time + 1.0)[:, None, None] * wave * left_part
+    angles = [0.7 * np.sin(9 * time), 0.8 * np.sin(14 * time + 1.0), 0.6 * np.cos(11 * time)]
+    turns = Rotation.from_euler("yxz", np.stack(angles, axis=1)).as_matrix()
+    W = (turns[:, :2] @ (shape + motion)).reshape(2 * frames, -1)
+    shuffled = W[:, np.random.default_rng(0).permutation(side**2)]
+    unrest = [reconstruct(tracks).diagnostics.camera_criteria["unrest"] for tracks in (W, shuffled)]
+    assert max(unrest) < 0.16
+
+
+@pytest.mark.parametrize("method", ["nuclear", "reweighted", "auto"])
+def test_where_points_rest_the_camera_sees_what_the_free_camera_saw(method: str) -> None:
+    rng = np.random.default_rng(1)
+    time = np.linspace(0.0, 1.0, 60)
+    shapes = rng.standard_normal((3, 40)) + np.zeros((60, 1, 1))
+    shapes[:, :, 20:] += 0.6 * np.sin(9.0 * time)[:, None, None] * rng.standard_normal((3, 20))
+    angles = [0.7 * np.sin(9 * time), 0.8 * np.sin(14 * time + 1.0), 0.6 * np.cos(11 * time)]
+    turns = Rotation.from_euler("yxz", np.stack(angles, axis=1)).as_matrix()
+    W = (turns[:, :2] @ shapes).reshape(120, -1)
+    rested = reconstruct(W, shape_method=method)
+    free = reconstruct(W, shape_method=method, camera_model="relaxed")
+    assert rested.diagnostics.camera_model == "relaxed"
+    assert "turned to where points rest" in rested.diagnostics.camera_reason
+    assert "keep to no axis" in rested.diagnostics.camera_reason
+    depths = [
+        np.einsum("ti,tni->tn", complete(one.cameras)[:, 2], one.shapes) for one in (rested, free)
+    ]
+    sign = np.sign((depths[0] * depths[1]).sum())
+    np.testing.assert_allclose(depths[0], sign * depths[1], atol=1e-9 * np.abs(W).max())
 
 
 @pytest.mark.parametrize("preset", PRESETS)

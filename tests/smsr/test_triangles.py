@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from smsr import triangles
-from smsr.triangles import NotUsableError, Triangle, every_nth, merged
+from smsr.triangles import NotUsableError, Triangle, merged, within
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,7 +23,7 @@ def points(width: int, count: int, seed: int = 0) -> NDArray[np.float64]:
 
 def triangle_of(block: NDArray[np.float64], shift: NDArray[np.float64]) -> Triangle:
     """Reduce a block of points that stands alone."""
-    return triangles.triangle_of(slice(0, block.shape[1]), block, shift=shift, step=1000)
+    return triangles.triangle_of(slice(0, block.shape[1]), block, shift=shift, sampled=np.arange(0))
 
 
 def assert_stands_for(triangle: Triangle, X: NDArray[np.float64], tolerance: float) -> None:
@@ -57,18 +57,18 @@ def test_joined_parts_stand_for_the_whole(width: int, count: int, cuts: set[int]
 
 
 @pytest.mark.parametrize("cuts", [(), (1, 2, 40), (7, 29)])
-@pytest.mark.parametrize("step", [1, 7, 100])
-def test_every_nth_point_is_kept_however_blocks_are_cut(cuts: tuple[int, ...], step: int) -> None:
+@pytest.mark.parametrize("numbers", [[], [0, 59], [2, 3, 7, 28, 29, 30]])
+def test_a_sample_is_kept_however_blocks_are_cut(cuts: tuple[int, ...], numbers: list[int]) -> None:
     X = points(4, 60)
     shift = X[:, 0]
     edges = [0, *cuts, 60]
+    sampled = np.array(numbers, np.intp)
     parts = [
-        triangles.triangle_of(slice(start, stop), X[:, start:stop], shift=shift, step=step)
+        triangles.triangle_of(slice(start, stop), X[:, start:stop], shift=shift, sampled=sampled)
         for start, stop in itertools.pairwise(edges)
     ]
-    np.testing.assert_array_equal(merged(parts).sample, X[:, ::step] - shift[:, None])
-    assert every_nth(slice(10, 20), 8) == slice(6, 10, 8)
-    assert every_nth(slice(10, 12), 8) == slice(2, 2, 8)
+    np.testing.assert_array_equal(merged(parts).sample, X[:, sampled] - shift[:, None])
+    np.testing.assert_array_equal(within(slice(7, 29), np.array([2, 7, 28, 29])), [0, 21])
 
 
 @pytest.mark.parametrize("count", [5, 12, 13, 767, 768, 50_000])
