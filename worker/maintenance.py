@@ -108,14 +108,15 @@ class Maintenance:
         self._removed("garbage", count)
 
     def collect_orphans(self) -> None:
-        """Once an hour, remove old objects that no record knows.
+        """Once an hour, remove old objects that no record knows, and tickets of no job.
 
-        Such are uploads whose client went away before there was a job, and results of an attempt
-        that wrote on after it had been given up.
+        Such objects are uploads whose client went away before there was a job, and results of an
+        attempt that wrote on after it had been given up.
         """
         settings = self.queue.settings
         period = min(ORPHAN_LOOK_SECONDS, settings.orphan_grace_seconds)
         if self.queue.redis.set(f"{PREFIX}:orphans", 1, nx=True, px=int(period * 1000)):
+            self.queue.sweep_tickets()
             count = 0
             for prefix in self._orphans(time.time() - settings.orphan_grace_seconds):
                 log.info("objects of no job removed", prefix=prefix)
