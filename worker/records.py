@@ -707,6 +707,18 @@ class RecordStore:
         most = "" if allowance.jobs is None else allowance.jobs
         return cast("Literal['ok']", self._step("retry", job_id, most).decode())
 
+    def keep(self, job_id: str, ttl: float | None) -> bool:
+        """Have a job kept for some seconds after its end; False when there is no such job.
+
+        Parameters
+        ----------
+        job_id : str
+        ttl : float or None
+            0 keeps it for ever; None for the time that holds for all.
+        """
+        own = "" if ttl is None else ttl
+        return bool(self._step("keep", job_id, own, self.result_ttl) == b"ok")
+
     def forget_inputs(self, job_id: str) -> None:
         """Note that the files of a job's inputs are gone."""
         self._step("forget_inputs", job_id)
