@@ -6,10 +6,13 @@ import base64
 import hashlib
 import itertools
 import json
+import shutil
 import signal
 import socket
+import subprocess
 import threading
 import uuid
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import httpx
@@ -33,10 +36,10 @@ from tests.service.conftest import (
 from worker.uploads import Upload, UploadStore
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from smsr.synthetic import Example
     from tests.conftest import RedisProcess
+
+BROWSERS_CLIENT = Path(__file__).resolve().parent.parent / "tus"
 
 MIB = 1 << 20
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -145,6 +148,33 @@ def test_the_protocols_own_client_and_a_job_with_three_uploads(
     job = finished(client, answer)
     assert job["status"] == "succeeded"
     assert job["metrics"]["e3d"] < 0.3
+
+
+@pytest.mark.skipif(
+    shutil.which("node") is None or not (BROWSERS_CLIENT / "node_modules").is_dir(),
+    reason="needs node and `npm ci` in tests/tus",
+)
+def test_the_client_of_browsers(client: httpx.Client, api: Api, tmp_path: Path) -> None:
+    content = large(6)
+    path = tmp_path / "w.npy"
+    path.write_bytes(content)
+    command = ["node", "upload.mjs", f"{api.url}/v1/uploads", str(path)]
+    run = subprocess.run(
+        command, cwd=BROWSERS_CLIENT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    told = json.loads(run.stdout)
+    broken = told["broken"]
+    assert broken["stopped"]
+    assert broken["same"]
+    assert broken["from"] >= len(content) / 2, "it began again"
+    for url in (broken["url"], told["whole"], told["posted"]):
+        upload = client.get(url).json()
+        assert upload["complete"]
+        assert upload["name"] == "w.npy"
+        assert upload["sha256"] == hashlib.sha256(content).hexdigest()
+        assert client.delete(url).status_code == 204
+    problem(client.get(told["removed"]), "unknown-upload", 404)
 
 
 def test_an_upload_serves_once(client: httpx.Client, tracks: bytes) -> None:
