@@ -75,7 +75,7 @@ LEAST = {"worker": 5, "work-horse": 5, "API": 3, "Redis": len(REDIS_AT), "storag
 
 STANDING = re.compile(
     r"smsr:(counters|workers|maintained|looking|orphans|incoming)"
-    r"|rq:(queues|workers(:.*)?|worker:.*|clean_registries:.*)"
+    r"|rq:(queues|workers(:.*)?)"
 )
 """Keys that are there without jobs, too; all others have to be gone, or go by themselves."""
 

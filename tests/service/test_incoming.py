@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import threading
+import time
 import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +34,8 @@ from tests.service.conftest import (
     settings_for,
     wait_for,
 )
-from worker.uploads import Upload, UploadStore
+from worker.records import new_job_id
+from worker.uploads import Upload, UploadStore, new_folder
 
 if TYPE_CHECKING:
     from smsr.synthetic import Example
@@ -530,6 +532,32 @@ def test_abandoned_uploads_expire_and_are_counted(
         assert client.get("/v1/uploads").json() == {"uploads": []}
         assert not list(redis_process.client().scan_iter("smsr:upload*"))
         assert not list(redis_process.client().scan_iter("smsr:incoming"))
+
+
+def begun(owner: str) -> Upload:
+    return Upload(id=new_job_id(), owner=owner, folder=new_folder(), name="w", length=3)
+
+
+def test_what_is_known_of_uploads_goes_with_them(
+    redis_process: RedisProcess, redis_url: str
+) -> None:
+    """A client that leaves uploads behind for months leaves no trace of them in Redis."""
+    client = redis_process.client()
+    brief, long = UploadStore(client, ttl=0.2), UploadStore(client, ttl=60)
+    for _ in range(25):
+        assert brief.create(begun("ann"))
+    kept = begun("ann")
+    assert long.create(kept)
+    assert client.zcard("smsr:uploads@ann") == 26
+    time.sleep(0.3)
+    for _ in range(3):
+        assert brief.create(begun("ann"))
+    assert client.zcard("smsr:uploads@ann") == 4
+    assert [upload.id for upload in brief.list("ann")][-1] == kept.id
+    assert 50 < client.ttl("smsr:uploads@ann") <= 60
+    assert brief.create(begun("bob"))
+    time.sleep(0.3)
+    assert not client.exists("smsr:uploads@bob")
 
 
 def test_uploads_have_owners(redis_process: RedisProcess, redis_url: str) -> None:
