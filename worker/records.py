@@ -524,6 +524,10 @@ class RecordStore:
         """Note that nothing is left under a storage prefix."""
         self.redis.zrem(f"{PREFIX}:garbage", prefix)
 
+    def put_off_garbage(self, prefix: str, seconds: float) -> None:
+        """Have a storage prefix that could not be emptied looked at again after some seconds."""
+        self.redis.zadd(f"{PREFIX}:garbage", {prefix: self._now() + seconds}, xx=True)
+
     def sign_of_life(self, worker: str, forget_seconds: float = 3600) -> None:
         """Note that a worker process lives."""
         now = self._now()

@@ -188,10 +188,14 @@ def test_maintenance_outlives_a_failing_storage(queue: JobQueue, submit: Submitt
     queue.delete(job_id)
     queue.storage.folder.joinpath("uploads").rmdir()
     queue.storage.folder.joinpath("uploads").write_bytes(b"a file in the way")
-    queue.redis.zadd("smsr:garbage", {f"uploads/{job_id}/": 1})
+    queue.storage.put_bytes("results/x/1/shapes.npy", b"x")
+    queue.redis.zadd("smsr:garbage", {f"uploads/{job_id}/": 1, "results/x/1/": 2})
     Maintenance(queue).run_once()
-    assert queue.redis.zscore("smsr:garbage", f"uploads/{job_id}/") is not None
+    assert (queue.redis.zscore("smsr:garbage", f"uploads/{job_id}/") or 0) > time.time() + 30
+    assert queue.redis.zscore("smsr:garbage", "results/x/1/") is None, "held up by the other"
+    assert list(queue.storage.list_prefix("results/")) == []
     queue.storage.folder.joinpath("uploads").unlink()
+    queue.redis.zadd("smsr:garbage", {f"uploads/{job_id}/": 1})
     Maintenance(queue).run_once()
     assert queue.redis.zscore("smsr:garbage", f"uploads/{job_id}/") is None
 
