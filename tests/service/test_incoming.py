@@ -6,6 +6,7 @@ import base64
 import hashlib
 import itertools
 import json
+import select
 import shutil
 import signal
 import socket
@@ -34,7 +35,7 @@ from tests.service.conftest import (
     settings_for,
     wait_for,
 )
-from worker.records import new_job_id
+from worker.records import new_job_id, upload_key
 from worker.uploads import Upload, UploadStore, new_folder
 
 if TYPE_CHECKING:
@@ -95,8 +96,7 @@ def job_of(client: httpx.Client, **uploads: str) -> httpx.Response:
 
 def stored_bytes(api: Api, job: httpx.Response, role: str = "measurements") -> bytes:
     assert job.status_code == 201, job.text
-    stored = api.objects / "uploads" / str(job.json()["id"]) / role
-    return stored.read_bytes()
+    return api.storage().get(upload_key(job.json()["id"], role))
 
 
 def test_what_is_spoken(client: httpx.Client) -> None:
@@ -416,15 +416,19 @@ def test_of_two_requests_at_once_the_later_one_holds(client: httpx.Client, api: 
     data = large(24)
     url = create(client, len(data))
     hung = begin_patch(api, url, 0, len(data))
-    hung.sendall(data[: 6 * MIB])
+    hung.sendall(data[: 10 * MIB])  # a bucket gets 8 MiB at a time
     wait_for(lambda: offset_of(client, url) >= 4 * MIB)
     offset = offset_of(client, url)
-    assert patch(client, url, offset, data[offset : 10 * MIB]).status_code == 204
-    hung.sendall(bytes(10 * MIB))  # other bytes than the right ones, and too late
+    assert patch(client, url, offset, data[offset : 14 * MIB]).status_code == 204
+    late = len(data) - 10 * MIB
+    while late and not select.select([hung], [], [], 0.2)[0]:
+        step = min(late, 2 * MIB)
+        hung.sendall(bytes(step))  # other bytes than the right ones, and too late
+        late -= step
     assert hung.recv(100).startswith(b"HTTP/1.1 409")
     hung.close()
-    assert offset_of(client, url) == 10 * MIB
-    assert patch(client, url, 10 * MIB, data[10 * MIB :]).status_code == 204
+    assert offset_of(client, url) == 14 * MIB
+    assert patch(client, url, 14 * MIB, data[14 * MIB :]).status_code == 204
     assert client.get(url).json()["sha256"] == hashlib.sha256(data).hexdigest()
     assert stored_bytes(api, job_of(client, measurements=url)) == data
 
