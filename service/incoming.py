@@ -55,8 +55,6 @@ BLOCK_BYTES = 512 << 10
 SAFE_BYTES = 4 << 20
 PART_BYTES = 8 << 20
 """What is made safe at once, in a local folder and in a bucket: a killed process loses less."""
-GATHERED_BYTES = 16 << 20
-"""The same while the storage is busy with what came before: this bounds the memory."""
 
 ID_LENGTH = 32
 _HOLD_MARGIN_SECONDS = 60.0
@@ -301,10 +299,7 @@ class _Piece:
             self._look(block, received)
             await self._hash(block)
             self._blocks.append(block)
-            # While the storage is busy more is gathered for it: the larger the steps, the faster.
-            gathered = received - self._handed
-            busy = self._writing is not None and not self._writing.done()
-            if gathered >= (GATHERED_BYTES if busy else at_once):
+            if received - self._handed >= at_once:
                 await self._write(received)
         await self._write(received)
         await self._settle()

@@ -417,7 +417,7 @@ def test_of_two_requests_at_once_the_later_one_holds(client: httpx.Client, api: 
     url = create(client, len(data))
     hung = begin_patch(api, url, 0, len(data))
     hung.sendall(data[: 10 * MIB])  # a bucket gets 8 MiB at a time
-    wait_for(lambda: offset_of(client, url) >= 4 * MIB)
+    wait_for(lambda: offset_of(client, url) >= 8 * MIB)
     offset = offset_of(client, url)
     assert patch(client, url, offset, data[offset : 14 * MIB]).status_code == 204
     late = len(data) - 10 * MIB
