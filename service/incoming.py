@@ -52,9 +52,8 @@ if TYPE_CHECKING:
 
 BLOCK_BYTES = 512 << 10
 """What is hashed and written at once: small enough to be in the processor's cache still."""
-SAFE_BYTES = 4 << 20
-PART_BYTES = 8 << 20
-"""What is made safe at once, in a local folder and in a bucket: a killed process loses less."""
+SAFE_BYTES = 8 << 20
+"""What is made safe at once, while as much again arrives; a killed process loses both at most."""
 
 ID_LENGTH = 32
 _HOLD_MARGIN_SECONDS = 60.0
@@ -284,7 +283,6 @@ class _Piece:
                 beginning, shared.uploads, shared.storage, upload, self._offset
             )
         broken: Exception | None = None
-        at_once = SAFE_BYTES if shared.storage.folder is not None else PART_BYTES
         received = self._offset
         while broken is None:
             try:
@@ -299,7 +297,7 @@ class _Piece:
             self._look(block, received)
             await self._hash(block)
             self._blocks.append(block)
-            if received - self._handed >= at_once:
+            if received - self._handed >= SAFE_BYTES:
                 await self._write(received)
         await self._write(received)
         await self._settle()
