@@ -25,7 +25,7 @@ import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import redis
@@ -128,8 +128,7 @@ def bare_single(url: str, path: Path) -> float:
         job = queue.enqueue("benchmarks.load.solve", str(path), result_ttl=600)
         while job.get_status(refresh=True) != JobStatus.FINISHED:
             time.sleep(0.01)
-        seconds: float = job.return_value(refresh=True)
-        return seconds
+        return cast("float", job.return_value(refresh=True))
 
 
 def single(client: Client, path: Path) -> tuple[float, float]:
