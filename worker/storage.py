@@ -19,7 +19,7 @@ import uuid
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
@@ -552,14 +552,16 @@ async def _write_file(target: Path, meter: _Meter, chunks: AsyncIterable[bytes])
     with staged.open("xb", buffering=0) as file:
         guard = threading.Lock()  # held by a thread that writes, which a cancelled task leaves
 
-        def write(block: bytes) -> None:
+        def take(block: bytes) -> None:
+            meter.sha256.update(block)  # here, while it is in the processor's cache
             with guard:
                 left = memoryview(block)
                 while left and not file.closed:
                     left = left[file.write(left) :]
 
+        loop = asyncio.get_running_loop()
         try:
-            writing: asyncio.Future[Any] | None = None
+            writing: asyncio.Future[None] | None = None
             syncing: asyncio.Future[None] | None = None
             unsynced = 0
             async for block in meter.count(chunks):
@@ -570,9 +572,7 @@ async def _write_file(target: Path, meter: _Meter, chunks: AsyncIterable[bytes])
                     if syncing is not None:
                         syncing.result()
                     syncing, unsynced = _begin_sync(file.fileno()), 0
-                writing = asyncio.gather(
-                    asyncio.to_thread(write, block), asyncio.to_thread(meter.sha256.update, block)
-                )
+                writing = loop.run_in_executor(None, take, block)
                 unsynced += len(block)
             if writing is not None:
                 await writing
