@@ -75,9 +75,10 @@ LEAST = {"worker": 5, "work-horse": 5, "API": 3, "Redis": len(REDIS_AT), "storag
 
 STANDING = re.compile(
     r"smsr:(counters|workers|maintained|looking|orphans|incoming)"
-    r"|rq:(queues|workers(:.*)?)"
+    r"|rq:(queues|workers(:.*)?|wip:.*)"
 )
-"""Keys that are there without jobs, too; all others have to be gone, or go by themselves."""
+"""Keys that are there without jobs, too, and RQ's list of what runs, whose entries lapse; all others
+have to be gone, or go by themselves."""
 
 
 @dataclass
