@@ -77,8 +77,8 @@ STANDING = re.compile(
     r"smsr:(counters|workers|maintained|looking|orphans|incoming)"
     r"|rq:(queues|workers(:.*)?|wip:.*)"
 )
-"""Keys that are there without jobs, too, and RQ's list of what runs, whose entries lapse; all others
-have to be gone, or go by themselves."""
+"""Keys that are there without jobs, too, and RQ's list of what runs, whose entries lapse; all
+others have to be gone, or go by themselves."""
 
 
 @dataclass
