@@ -48,7 +48,8 @@ BYTES_RETRY_SECONDS = 600
 """What it says when an owner's storage is full, which someone has to see to."""
 
 _REDIS_CANNOT = ("MISCONF", "NOREPLICAS", "MASTERDOWN", "CLUSTERDOWN")
-"""Errors of a Redis server that cannot write, to a full disk for instance."""
+"""Errors of a Redis server that cannot write, to a full disk for instance; those of a script have
+them within the text before Redis 7."""
 
 _log = logging.getLogger(__name__)
 
@@ -717,7 +718,7 @@ async def _on_redis_away(request: Request, error: Exception) -> ProblemResponse:
 
 async def _on_redis_error(request: Request, error: Exception) -> ProblemResponse:
     """Answer for a Redis that says why it cannot serve, as for one that is away."""
-    if str(error).startswith(_REDIS_CANNOT):
+    if any(reason in str(error) for reason in _REDIS_CANNOT):
         return redis_away(request, error)
     _log.error("Redis refused a command", exc_info=error)
     return await _on_anything_else(request, error)
