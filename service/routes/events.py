@@ -6,6 +6,7 @@ import asyncio
 import json
 import re
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Header, Request, Response
@@ -18,7 +19,7 @@ from service.schemas import job_document
 from worker.changes import Deletion, Gap
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
     from starlette.types import Receive, Scope, Send
 
@@ -52,7 +53,7 @@ class EventStream(EventSourceResponse):
     ) -> None:
         self._gate: Gate = request.app.state.gate
         self._key = request.state.key
-        over = self._gate.until_invalid(self._key, heartbeat)
+        over = partial(self._gate.until_invalid, self._key, heartbeat)
         super().__init__(_until(over, events), ping=heartbeat, sep="\n", send_timeout=SEND_SECONDS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -62,10 +63,10 @@ class EventStream(EventSourceResponse):
 
 
 async def _until(
-    over: Coroutine[Any, Any, None], events: AsyncIterator[ServerSentEvent]
+    over: Callable[[], Awaitable[None]], events: AsyncIterator[ServerSentEvent]
 ) -> AsyncIterator[ServerSentEvent]:
     """Pass events on until they end or something is over."""
-    ending, coming = asyncio.ensure_future(over), None
+    ending, coming = asyncio.ensure_future(over()), None
     try:
         while True:
             coming = asyncio.ensure_future(_next(events))

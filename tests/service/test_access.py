@@ -174,6 +174,8 @@ def test_streams_are_limited_key_by_key(guarded: Guarded) -> None:
         assert int(refused.headers["Retry-After"]) > 0
         with other.stream("GET", "/v1/events") as answer:
             assert answer.status_code == 200
+        assert other.head("/v1/events").status_code == 200
+        assert "never awaited" not in guarded.api.log.read_text()
         open_.close()
 
         def again() -> bool:
