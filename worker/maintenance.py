@@ -146,6 +146,8 @@ class Maintenance:
         if self.queue.redis.set(f"{PREFIX}:orphans", 1, nx=True, px=int(period * 1000)):
             self.queue.sweep_tickets()
             orphans = self._orphans(time.time() - settings.orphan_grace_seconds)
+            for prefix in orphans:
+                log.info("objects of no job are removed", prefix=prefix)
             # What cannot be removed now is an orphan the next time, too.
             self._empty(
                 "orphan",
