@@ -3,20 +3,25 @@
     python benchmarks/faults.py --jobs 200
 
 Two API processes and two workers share a Redis server (append-only file, every write synced) and a
-folder. While clients send jobs of mixed size and wait for them, workers and their work-horses are
-killed with SIGKILL every few seconds, one API process again and again in the middle of uploads,
-Redis twice, and for ten seconds the storage can be neither written nor read. At the end the script
-compares all arrays with those of runs in its own process, looks for jobs that are lost, doubled or
-ended twice, deletes all jobs and looks for what is left over. It exits with 1 where anything is.
+folder. While clients send jobs of mixed size, by multipart and by tus, and wait for them, workers
+and their work-horses are killed with SIGKILL every few seconds, one API process again and again in
+the middle of uploads, Redis twice, and for ten seconds the storage can be neither written nor read.
+At the end the script compares all arrays with those of runs in its own process, looks for jobs that
+are lost, doubled or ended twice (by the service's own count, and by the webhooks that a receiver
+got), deletes all jobs and looks for what is left over. It exits with 1 where anything is, and where
+the jobs were done before everything had been broken.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import contextlib
 import hashlib
+import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -24,10 +29,11 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,6 +64,21 @@ DISTINCT = 7
 """Matrices of each size."""
 SENDERS = 6
 PATIENCE = 600.0
+ARRAYS = ("shapes", "cameras", "translations")
+
+REDIS_AT = (12.0, 36.0)
+STORAGE_AT = 22.0
+STORAGE_SECONDS = 10.0
+"""When what is not broken again and again is broken, in seconds from the start."""
+LEAST = {"worker": 5, "work-horse": 5, "API": 3, "Redis": len(REDIS_AT), "storage": 1}
+"""How often each has to have been broken for a run to count."""
+
+STANDING = re.compile(
+    r"smsr:(counters|workers|maintained|looking|orphans|incoming)"
+    r"|rq:(queues|workers(:.*)?|wip:.*)"
+)
+"""Keys that are there without jobs, too, and RQ's list of what runs, whose entries lapse; all
+others have to be gone, or go by themselves."""
 
 
 @dataclass
@@ -75,19 +96,27 @@ class Killer:
 
     def run(self) -> None:
         """Break something every few seconds."""
-        rounds = 0
+        began, rounds = time.monotonic(), 0
+        redis_at, storage_at = [*REDIS_AT], [STORAGE_AT]
         while not self.stop.wait(self.rng.uniform(1.5, 3.5)):
             rounds += 1
             self._kill_worker()
             if rounds % 3 == 0:
                 self._kill_api()
-            if rounds in (8, 20):
+            if redis_at and time.monotonic() - began > redis_at[0]:
+                redis_at.pop(0)
                 self.redis.kill()
-                self.done["Redis killed"] += 1
+                self.done["Redis"] += 1
                 time.sleep(1.0)
                 self.redis.start()
-            if rounds == 14:
-                self._break_storage(10.0)
+            if storage_at and time.monotonic() - began > storage_at[0]:
+                storage_at.pop()
+                self._break_storage()
+
+    def missing(self) -> list[str]:
+        """Return what was not broken as often as it has to be."""
+        found = ((what, self.done[what], least) for what, least in LEAST.items())
+        return [f"broken too rarely: {w}, {n} of {least}" for w, n, least in found if n < least]
 
     def _kill_worker(self) -> None:
         workers = self.pool.pids
@@ -98,10 +127,11 @@ class Killer:
         what = self.rng.choice(["work-horse", "worker", "both"])
         if what != "work-horse":
             kill(worker)
+            self.done["worker"] += 1
         if what != "worker":
             for horse in horses:
                 kill(horse)
-        self.done[f"{what} killed"] += 1
+                self.done["work-horse"] += 1
 
     def _kill_api(self) -> None:
         """Wait for an upload to be under way, then kill the process that receives it."""
@@ -109,16 +139,16 @@ class Killer:
         if self.uploading.wait(3.0) and self.api.pid is not None:
             time.sleep(self.rng.uniform(0.0, 0.02))
             kill(self.api.pid)
-            self.done["API killed in an upload"] += 1
+            self.done["API"] += 1
 
-    def _break_storage(self, seconds: float) -> None:
+    def _break_storage(self) -> None:
         away = self.objects.with_name("objects.away")
         self.objects.rename(away)
         self.objects.touch()  # a file: no folder can be made where it stands
-        self.stop.wait(seconds)
+        self.stop.wait(STORAGE_SECONDS)
         self.objects.unlink()
         away.rename(self.objects)
-        self.done["storage broken for 10 s"] += 1
+        self.done["storage"] += not self.stop.is_set()
 
 
 class RedisServer:
@@ -164,9 +194,44 @@ def children(parent: int) -> list[int]:
     return found
 
 
-def digest(array: np.ndarray) -> str:
-    """Return a hash of an array's values."""
-    return hashlib.sha256(np.ascontiguousarray(array, dtype=np.float32).tobytes()).hexdigest()
+def digest(folder: Path) -> str:
+    """Return a hash of the arrays of a result, types and shapes included."""
+    found = hashlib.sha256()
+    for name in ARRAYS:
+        array = np.load(folder / f"{name}.npy")
+        found.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
+    return found.hexdigest()
+
+
+@dataclass
+class Receiver:
+    """What webhooks told: for each job the ids and types of its messages."""
+
+    url: str = ""
+    told: defaultdict[str, set[tuple[str, str]]] = field(default_factory=lambda: defaultdict(set))
+
+
+@contextlib.contextmanager
+def receiving() -> Iterator[Receiver]:
+    """Take webhooks until the block ends."""
+    receiver = Receiver()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            document = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+            message = (self.headers["webhook-id"], document["type"])
+            receiver.told[document["data"]["id"]].add(message)
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        receiver.url = f"http://127.0.0.1:{server.server_address[1]}/"
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield receiver
+        server.shutdown()
 
 
 def make_inputs(folder: Path) -> dict[Path, str]:
@@ -179,7 +244,7 @@ def make_inputs(folder: Path) -> dict[Path, str]:
             np.save(path, example.measurements)
             result = folder / "result"
             smsr.reconstruct(path, out=result)
-            expected[path] = digest(np.load(result / "shapes.npy"))
+            expected[path] = digest(result)
             shutil.rmtree(result)
     return expected
 
@@ -197,6 +262,9 @@ def cluster(folder: Path) -> Iterator[tuple[JobQueue, Killer, list[str]]]:
         log_level="ERROR",
         max_attempts=100,
         orphan_grace_seconds=20,
+        webhook_secret="whsec_" + base64.b64encode(os.urandom(32)).decode(),
+        webhook_http=True,
+        webhook_allow="127.0.0.0/8",
     )
     objects = settings.data_dir / "objects"
     objects.mkdir(parents=True)
@@ -254,22 +322,31 @@ class Sender:
 
     urls: list[str]
     killer: Killer
+    webhook: str
     refused: Counter[str] = field(default_factory=Counter)
 
     def run(self, number: int, path: Path) -> tuple[str, Path]:
         """Send one job until it is accepted, wait for its end; return its id."""
-        with Client(self.urls[number % 2], patience=PATIENCE) as client:
-            job = self._submit(client, path)
-            return client.wait(job.id, timeout=PATIENCE).id, path
+        api, by_tus = number % 2, number // 2 % 2
+        with Client(self.urls[api], patience=PATIENCE) as client:
 
-    def _submit(self, client: Client, path: Path) -> Job:
-        def told(done: int, _total: int) -> None:
-            if done > 0:
-                self.killer.uploading.set()
+            def told(done: int, _total: int) -> None:
+                if done > 0 and api == 0:  # the one that is killed
+                    self.killer.uploading.set()
 
+            submit = partial(
+                client.submit,
+                path,
+                settings={"reuse": False, "webhook": self.webhook},
+                progress=told,
+                resumable=0 if by_tus else 1 << 40,
+            )
+            return client.wait(self._insist(submit).id, timeout=PATIENCE).id, path
+
+    def _insist(self, submit: Callable[[], Job]) -> Job:
         while True:
             try:
-                return client.submit(path, settings={"reuse": False}, progress=told)
+                return submit()
             except ServiceError as error:
                 # What a client that is cut off may be told; it sends again.
                 self.refused[error.slug or str(error.status)] += 1
@@ -278,7 +355,9 @@ class Sender:
                 time.sleep(0.5)
 
 
-def check(queue: JobQueue, ids: dict[str, Path], expected: dict[Path, str]) -> list[str]:
+def check(
+    queue: JobQueue, ids: dict[str, Path], expected: dict[Path, str], receiver: Receiver
+) -> list[str]:
     """Return what is wrong, a line each."""
     wrong = []
     listed, cursor = [], None
@@ -292,26 +371,34 @@ def check(queue: JobQueue, ids: dict[str, Path], expected: dict[Path, str]) -> l
     wrong += [f"doubled: {job}" for job in listed if job not in ids]
     for job, path in ids.items():
         record = queue.records.get(job)
-        if record is None or record.status != "succeeded":
+        if record is None or record.status != "succeeded" or record.result_prefix is None:
             status = record and (record.status, record.problem)
             wrong.append(f"not succeeded: {job} {status}")
             continue
-        found = queue.storage.open_local(f"{record.result_prefix}shapes.npy", path.parent)
-        if digest(np.load(found)) != expected[path]:
+        assert queue.storage.folder is not None
+        if digest(queue.storage.folder / record.result_prefix) != expected[path]:
             wrong.append(f"wrong arrays: {job} of {path.name}")
     ended = queue.records.survey(60).counters.ended
     if ended != {"succeeded": len(ids)}:
         wrong.append(f"ends counted: {ended}")
+    for job in {*ids, *receiver.told}:
+        types = [kind for _, kind in receiver.told[job]]
+        if types != ["job.succeeded"]:
+            wrong.append(f"webhooks told of {job}: {types}")
     return wrong
 
 
-def leftovers(queue: JobQueue) -> list[str]:
-    """Return the objects and keys that are there."""
-    objects = [
-        item.key for kind in ("uploads/", "results/") for item in queue.storage.list_prefix(kind)
+def leftovers(queue: JobQueue, settings: Settings) -> list[str]:
+    """Return the files and keys that should not be there without a job."""
+    folders = (settings.data_dir / "objects", settings.scratch)
+    files = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+    redis = queue.redis
+    keys = [
+        f"{key.decode()}: {redis.hgetall(key) if redis.type(key) == b'hash' else redis.dump(key)!r}"
+        for key in redis.scan_iter("*")
+        if not STANDING.fullmatch(key.decode()) and redis.pttl(key) == -1
     ]
-    keys = [key.decode() for key in queue.redis.scan_iter("*")]
-    return objects + [key for key in keys if key.startswith(("smsr:job", "rq:job", "smsr:upload"))]
+    return [str(path) for path in files if path.suffix != ".lock"] + keys
 
 
 def run(jobs: int) -> int:
@@ -324,11 +411,11 @@ def run(jobs: int) -> int:
         by_size = [list(expected)[i : i + DISTINCT] for i in range(0, len(expected), DISTINCT)]
         rng = random.Random(1)
         paths = [rng.choice(rng.choices(by_size, SHARES)[0]) for _ in range(jobs)]
-        with cluster(folder) as (queue, killer, urls):
+        with receiving() as receiver, cluster(folder) as (queue, killer, urls):
             breaking = threading.Thread(target=killer.run)
             breaking.start()
             began = time.monotonic()
-            sender = Sender(urls, killer)
+            sender = Sender(urls, killer, receiver.url)
             with ThreadPoolExecutor(SENDERS) as senders:
                 ids = dict(senders.map(sender.run, range(jobs), paths))
             seconds = time.monotonic() - began
@@ -336,18 +423,24 @@ def run(jobs: int) -> int:
             breaking.join()
             records = [queue.records.get(job) for job in ids]
             attempts = Counter(record.attempt for record in records if record)
-            print(f"{jobs} jobs in {seconds:.0f} s; {dict(killer.done)}")
+            print(f"{jobs} jobs in {seconds:.0f} s; broken: {dict(killer.done)}")
             print(
                 f"attempts: {dict(sorted(attempts.items()))}; refused and sent again: "
-                f"{dict(sender.refused)}"
+                f"{dict(sender.refused)}",
+                flush=True,
             )
-            wrong = check(queue, ids, expected)
+            with contextlib.suppress(SystemExit):
+                wait_for(lambda: not queue.redis.exists("smsr:webhooks"))
+            wrong = killer.missing() + check(queue, ids, expected, receiver)
             for job in ids:
                 queue.delete(job)
             with contextlib.suppress(SystemExit):
-                wait_for(lambda: not leftovers(queue), 90)
-            wrong += [f"left over: {what}" for what in leftovers(queue)]
-    print("\n".join(wrong) or "each job succeeded once, with the right arrays; nothing is left")
+                wait_for(lambda: not leftovers(queue, queue.settings), 90)
+            wrong += [f"left over: {what}" for what in leftovers(queue, queue.settings)]
+    print(
+        "\n".join(wrong)
+        or "each job succeeded once, with the right arrays, and was told of once; nothing is left"
+    )
     return 1 if wrong else 0
 
 

@@ -8,7 +8,9 @@ reads a file by its path, solves and writes the arrays, without uploads, records
 or a way to ask. Batches of both alternate, so that what else the machine does falls on both.
 
 Then single jobs are sent to the idle service one after the other; the overhead of a job is the time
-from its first byte sent to its end known by the client, less the time that the solver took.
+from its first byte sent to its end known by the client, less the time that the solver took. As the
+solver reports its progress meanwhile, that time is compared with the same solve in an idle bare
+worker, too.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import redis
@@ -118,6 +120,17 @@ def service_batch(server: str, paths: Sequence[Path]) -> tuple[float, list[float
     return time.perf_counter() - began, [job.timings["queued"] for job in jobs]
 
 
+def bare_single(url: str, path: Path) -> float:
+    """Run one job in an idle bare worker; return the solver's seconds."""
+    time.sleep(IDLE_SECONDS)
+    with redis.Redis.from_url(url) as connection:
+        queue = Queue("bare", connection=connection, serializer=JSONSerializer)
+        job = queue.enqueue("benchmarks.load.solve", str(path), result_ttl=600)
+        while job.get_status(refresh=True) != JobStatus.FINISHED:
+            time.sleep(0.01)
+        return cast("float", job.return_value(refresh=True))
+
+
 def single(client: Client, path: Path) -> tuple[float, float]:
     """Send one job to the idle service; return its overhead and the solver's seconds."""
     time.sleep(IDLE_SECONDS)
@@ -169,7 +182,8 @@ def run(jobs: int, workers: int, batches: int, singles: int) -> None:
             seconds["service"].append(took)
             queued += waits
             print(f"  {len(batch)} jobs: bare {seconds['bare'][-1]:.1f} s, service {took:.1f} s")
-        overheads, solver = zip(*(single(client, path) for path in paths[jobs:]), strict=True)
+        ones = [(*single(client, path), bare_single(bare_url, path)) for path in paths[jobs:]]
+        overheads, solver, alone = zip(*ones, strict=True)
     bare, whole = sum(seconds["bare"]), sum(seconds["service"])
     ratios: list[Any] = [b / s for b, s in zip(seconds["bare"], seconds["service"], strict=True)]
     print(
@@ -178,7 +192,8 @@ def run(jobs: int, workers: int, batches: int, singles: int) -> None:
         f"service  {jobs / whole:.2f} jobs/s, {bare / whole:.2f} of bare RQ "
         f"(batches {min(ratios):.2f} to {max(ratios):.2f}); in the queue {percentiles(queued)}",
         f"idle service, {singles} single jobs: overhead {percentiles(overheads)} "
-        f"(solver {statistics.median(solver) * 1000:.0f} ms)",
+        f"(solver {statistics.median(solver) * 1000:.0f} ms; "
+        f"alone {statistics.median(alone) * 1000:.0f} ms)",
         sep="\n",
     )
 

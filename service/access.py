@@ -7,10 +7,13 @@ name of an account, or None where the API is open and all clients share everythi
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import ipaddress
 import math
 import time
+from collections import Counter
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from fastapi import Security
@@ -25,10 +28,12 @@ from starlette.requests import Request
 
 from service import problems
 from service.problems import Problem
-from worker.keys import find_key
+from worker.keys import find_key, is_valid
 from worker.records import ANY, PREFIX, Allowance
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from redis.asyncio import Redis
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -46,6 +51,9 @@ KEY_SCHEMES = (
     Security(APIKeyHeader(name="X-API-Key", scheme_name="header", auto_error=False)),
 )
 """What the OpenAPI document says of keys; that they are given is seen to by `Access`."""
+
+STREAMS_RETRY_SECONDS = 5
+"""What ``Retry-After`` says while a key has too many streams open."""
 
 _WINDOW_SECONDS = 60
 _FORWARDED = ("forwarded", "via", "x-forwarded-for", "x-forwarded-host", "x-real-ip")
@@ -80,6 +88,7 @@ class Gate:
         self.policy = policy
         self._settings = settings
         self._redis = redis
+        self._streams: Counter[str] = Counter()
         storage = RedisStorage(
             "async+redis://unused:1",  # the pool has the address
             implementation="redispy",
@@ -109,20 +118,22 @@ class Gate:
         if self._is_open_to(request.headers) and not (given or "").startswith("smsr_"):
             return {}  # what a proxy may have added is no concern here
         key = await find_key(self._redis, given) if given else None
-        if key is None:
-            raise self._unauthorized(given)
-        request.state.owner = key.owner
+        if key is None or key.expired(time.time()):
+            raise self._unauthorized(given, expired=key is not None)
+        request.state.owner, request.state.key = key.owner, key
         request.state.allowance = self._allowance(key)
         return await self._count(key)
 
     def _is_open_to(self, headers: Headers) -> bool:
         return self.policy == "open" or (self.policy == "loopback" and _comes_from_here(headers))
 
-    def _unauthorized(self, given: str | None) -> Problem:
+    def _unauthorized(self, given: str | None, *, expired: bool = False) -> Problem:
         if given:
             return Problem(
                 "unauthorized",
-                "There is no such API key; it may have been revoked.",
+                "The time of this API key is over; its operator makes another one."
+                if expired
+                else "There is no such API key; it may have been revoked.",
                 headers={"WWW-Authenticate": 'Bearer realm="smsr", error="invalid_token"'},
             )
         detail = "Send an API key as `Authorization: Bearer smsr_...`."
@@ -133,6 +144,53 @@ class Gate:
                 "or comes from a page of another site."
             )
         return Problem("unauthorized", detail, headers={"WWW-Authenticate": 'Bearer realm="smsr"'})
+
+    @contextmanager
+    def stream(self, key: ApiKey | None) -> Iterator[None]:
+        """Count a stream of events of a key for as long as it is open.
+
+        Raises
+        ------
+        Problem
+            The key has as many open as it may in this process.
+        """
+        if key is None:
+            yield
+            return
+        most = self._settings.key_streams if key.streams is None else key.streams
+        if most and self._streams[key.id] >= most:
+            raise Problem(
+                "too-many-streams",
+                f"This API key may have {most} streams of events open at a time.",
+                headers={"Retry-After": str(STREAMS_RETRY_SECONDS)},
+                limit=most,
+            )
+        self._streams[key.id] += 1
+        try:
+            yield
+        finally:
+            self._streams[key.id] -= 1
+            if not self._streams[key.id]:
+                del self._streams[key.id]
+
+    async def until_invalid(self, key: ApiKey | None, interval: float) -> None:
+        """Return when a key that was admitted has been revoked or has expired.
+
+        Parameters
+        ----------
+        key : ApiKey or None
+            For None, who needs no key, this never returns.
+        interval : float
+            Seconds between two looks.
+        """
+        while True:
+            pause = interval
+            if key is not None and key.expires_at is not None:
+                pause = min(pause, max(key.expires_at - time.time(), 0.0))
+            await asyncio.sleep(pause)
+            with suppress(RedisError):  # while it is away no key can be revoked
+                if key is not None and not await is_valid(self._redis, key.id):
+                    return
 
     def _allowance(self, key: ApiKey) -> Allowance:
         settings = self._settings
@@ -195,7 +253,7 @@ class Access:
             return
         request = Request(scope)
         gate: Gate = scope["app"].state.gate
-        request.state.owner, request.state.allowance = None, ANY
+        request.state.owner, request.state.key, request.state.allowance = None, None, ANY
         try:
             headers = await gate.admit(request)
         except Problem as problem:

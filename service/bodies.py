@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+import json
+from typing import TYPE_CHECKING, Any
 
 from starlette.requests import ClientDisconnect
 
 from service.problems import Problem
 
 if TYPE_CHECKING:
+    from starlette.datastructures import Headers
     from starlette.requests import Request
 
+JSON_BYTES = 128 << 10
+"""Longest JSON document that is read."""
+
+_JSON_SECONDS = 60.0
 _PATIENCE_STEP = 1.0
 """Seconds between two looks at the clock: packets come far more often than that."""
 
@@ -72,3 +78,57 @@ class Body:
         data = self._pending[0] if len(self._pending) == 1 else b"".join(self._pending)
         self._pending = []
         return data
+
+
+async def read_json(request: Request) -> dict[str, Any]:
+    """Read a body that is a JSON object.
+
+    Raises
+    ------
+    Problem
+        It is none, or too long.
+    """
+    body, text = Body(request, _JSON_SECONDS), b""
+    while block := await body.block(JSON_BYTES):
+        text += block
+        if len(text) > JSON_BYTES:
+            raise Problem("malformed-json", f"The document is longer than {JSON_BYTES} B.")
+    return json_object(text, "malformed-json", "The body is")
+
+
+def json_object(text: bytes | bytearray, slug: str, subject: str) -> dict[str, Any]:
+    """Return the JSON object in a text.
+
+    Parameters
+    ----------
+    text : bytes
+    slug, subject : str
+        Of the problem where there is none: its type, and what its detail begins with.
+
+    Raises
+    ------
+    Problem
+    """
+    try:
+        found = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
+    except RecursionError:
+        raise Problem(slug, f"{subject} nested too deeply.") from None
+    except ValueError as error:
+        raise Problem(slug, f"{subject} no valid JSON: {error}.") from None
+    if not isinstance(found, dict):
+        raise Problem(slug, f"{subject} a JSON {_type_of(found)}, not an object.")
+    return found
+
+
+def _type_of(value: object) -> str:
+    names = {list: "array", str: "string", bool: "boolean", type(None): "null"}
+    return names.get(type(value), "number")
+
+
+def _no_constant(name: str) -> object:
+    raise ValueError(f"{name} is no JSON")
+
+
+def content_type(headers: Headers) -> str:
+    """Return the media type of a body without its parameters, '' where none is said."""
+    return headers.get("content-type", "").partition(";")[0].strip().lower()

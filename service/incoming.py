@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import json
 import time
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from anyio import CancelScope, to_thread
 from starlette.requests import ClientDisconnect
 
 from service import quotas
-from service.bodies import Body
+from service.bodies import Body, read_json
 from service.digests import BodyDigests
 from service.problems import Problem
 from service.submissions import SETTINGS, Submission, check_webhook, hash_of, read_settings
-from service.uploads import FILES, OPTIONS_BYTES, UploadLimits, check_files
+from service.uploads import FILES, UploadLimits, check_files
 from smsr.errors import SmsrError
 from smsr.files import HEAD_BYTES, check_prefix
 from smsr.options import parse
@@ -43,7 +42,6 @@ from worker.uploads import (
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
-    from starlette.datastructures import Headers
     from starlette.requests import Request
 
     from service.context import Context
@@ -54,9 +52,8 @@ if TYPE_CHECKING:
 
 BLOCK_BYTES = 512 << 10
 """What is hashed and written at once: small enough to be in the processor's cache still."""
-SAFE_BYTES = 4 << 20
-PART_BYTES = 8 << 20
-"""What is made safe at once, in a local folder and in a bucket: a killed process loses less."""
+SAFE_BYTES = 8 << 20
+"""What is made safe at once, while as much again arrives; a killed process loses both at most."""
 
 ID_LENGTH = 32
 _HOLD_MARGIN_SECONDS = 60.0
@@ -286,7 +283,6 @@ class _Piece:
                 beginning, shared.uploads, shared.storage, upload, self._offset
             )
         broken: Exception | None = None
-        at_once = SAFE_BYTES if shared.storage.folder is not None else PART_BYTES
         received = self._offset
         while broken is None:
             try:
@@ -301,7 +297,7 @@ class _Piece:
             self._look(block, received)
             await self._hash(block)
             self._blocks.append(block)
-            if received - self._handed >= at_once:
+            if received - self._handed >= SAFE_BYTES:
                 await self._write(received)
         await self._write(received)
         await self._settle()
@@ -372,11 +368,6 @@ async def finish(shared: Context, upload: Upload) -> Upload:
 # Jobs made of uploads
 
 
-def is_json(headers: Headers) -> bool:
-    """Whether a body is a JSON document."""
-    return headers.get("content-type", "").partition(";")[0].strip().lower() == "application/json"
-
-
 @dataclass(frozen=True, slots=True)
 class References:
     """A submission that names uploads, by role."""
@@ -405,7 +396,7 @@ async def read_references(request: Request, shared: Context) -> References:
     Problem, smsr.errors.SmsrError
         The document is refused.
     """
-    document = await _read_document(request)
+    document = await read_json(request)
     ids = {role: _reference(role, document[role]) for role in FILES if role in document}
     unknown = [name for name in document if name not in (*FILES, "options", *SETTINGS)]
     if unknown:
@@ -445,27 +436,6 @@ async def take_references(shared: Context, references: References, job_id: str) 
     inputs = await _take(shared, uploads, job_id)
     folders = {upload.id: upload.folder for upload in uploads.values()}
     return Submission(options, inputs, frames, points, references.settings, folders)
-
-
-async def _read_document(request: Request) -> dict[str, Any]:
-    body, text = Body(request, 60.0), b""
-    while block := await body.block(OPTIONS_BYTES):
-        text += block
-        if len(text) > 2 * OPTIONS_BYTES:
-            raise Problem("malformed-json", f"The document is longer than {2 * OPTIONS_BYTES} B.")
-    try:
-        document = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
-    except RecursionError:
-        raise Problem("malformed-json", "The document is nested too deeply.") from None
-    except ValueError as error:
-        raise Problem("malformed-json", f"The body is no valid JSON: {error}.") from None
-    if not isinstance(document, dict):
-        raise Problem("malformed-json", "The body is no JSON object.")
-    return document
-
-
-def _no_constant(name: str) -> object:
-    raise ValueError(f"{name} is no JSON")
 
 
 def is_id(text: object) -> bool:

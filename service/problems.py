@@ -47,6 +47,10 @@ JOBS_RETRY_SECONDS = 5
 BYTES_RETRY_SECONDS = 600
 """What it says when an owner's storage is full, which someone has to see to."""
 
+_REDIS_CANNOT = ("MISCONF", "NOREPLICAS", "MASTERDOWN", "CLUSTERDOWN")
+"""Errors of a Redis server that cannot write, to a full disk for instance; those of a script have
+them within the text before Redis 7."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -156,6 +160,13 @@ _OF_THE_SERVICE = (
         "Submit again when some have ended; Retry-After says when to try.",
     ),
     ProblemType(
+        "too-many-streams",
+        "Too many streams of events at a time",
+        429,
+        "The API key has as many streams of events open as it may; `limit` says how many.",
+        "Close some. One stream of `/v1/events` tells of all jobs.",
+    ),
+    ProblemType(
         "too-many-bytes",
         "The storage of this owner is full",
         507,
@@ -219,7 +230,8 @@ _OF_THE_SERVICE = (
         "The body is of a type that is not taken here",
         415,
         "Jobs are submitted as multipart/form-data (RFC 7578) with a boundary, or as JSON that "
-        "names finished uploads; a piece of an upload is application/offset+octet-stream.",
+        "names finished uploads; a piece of an upload is application/offset+octet-stream, a change "
+        "of a job application/merge-patch+json.",
         "Send the measurement file as the part `measurements`, for instance with "
         "`curl -F measurements=@tracks.npy`.",
     ),
@@ -704,6 +716,14 @@ async def _on_redis_away(request: Request, error: Exception) -> ProblemResponse:
     return redis_away(request, error)
 
 
+async def _on_redis_error(request: Request, error: Exception) -> ProblemResponse:
+    """Answer for a Redis that says why it cannot serve, as for one that is away."""
+    if any(reason in str(error) for reason in _REDIS_CANNOT):
+        return redis_away(request, error)
+    _log.error("Redis refused a command", exc_info=error)
+    return await _on_anything_else(request, error)
+
+
 async def _on_too_many_jobs(request: Request, _error: Exception) -> ProblemResponse:
     most = request.state.allowance.jobs
     return respond(
@@ -774,6 +794,7 @@ def install(app: FastAPI) -> None:
         redis.exceptions.OutOfMemoryError,
     ):
         app.add_exception_handler(away, _on_redis_away)
+    app.add_exception_handler(redis.exceptions.ResponseError, _on_redis_error)
     app.add_exception_handler(TooManyJobs, _on_too_many_jobs)
     app.add_exception_handler(TooManyBytes, _on_too_many_bytes)
     app.add_exception_handler(StorageError, _on_storage_away)

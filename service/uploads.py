@@ -8,7 +8,6 @@ removed by `worker.maintenance`.
 
 from __future__ import annotations
 
-import json
 import re
 from contextlib import aclosing
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from multipart import (
     parse_options_header,
 )
 
-from service.bodies import Body
+from service.bodies import Body, json_object
 from service.digests import BodyDigests
 from service.problems import Problem
 from service.submissions import (
@@ -344,17 +343,7 @@ async def _read_options(body: AsyncIterator[bytes]) -> dict[str, Any]:
     text = await _read_text(body, OPTIONS_BYTES)
     if text is None:
         raise Problem("malformed-options", f"The options are longer than {OPTIONS_BYTES} bytes.")
-    try:
-        values = json.loads(text.decode("utf-8"), parse_constant=_no_constant)
-    except RecursionError:
-        raise Problem("malformed-options", "The options are nested too deeply.") from None
-    except ValueError as error:
-        raise Problem("malformed-options", f"The options are no valid JSON: {error}.") from None
-    if not isinstance(values, dict):
-        raise Problem(
-            "malformed-options", f"The options are a JSON {_json_type(values)}, not an object."
-        )
-    return values
+    return json_object(text, "malformed-options", "The options are")
 
 
 async def _read_setting(name: str, body: AsyncIterator[bytes]) -> str:
@@ -377,15 +366,6 @@ async def _read_text(body: AsyncIterator[bytes], most: int) -> bytearray | None:
         if len(text) > most:
             return None
     return text
-
-
-def _no_constant(name: str) -> object:
-    raise ValueError(f"{name} is no JSON")
-
-
-def _json_type(value: object) -> str:
-    names = {list: "array", str: "string", bool: "boolean", type(None): "null"}
-    return names.get(type(value), "number")
 
 
 def _boundary(request: Request) -> str:

@@ -9,10 +9,12 @@ import asyncio
 import json
 import random
 import ssl
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
+from functools import partial
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Self
 
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 
 AT_ONCE = 32
 """Most messages that a process delivers at the same time."""
+OF_A_HOST = 8
+"""Most of these that go to one host: one that does not answer must not hold up the others."""
 LOOK_SECONDS = 1.0
 """Time between two looks for messages that are due."""
 LEASE_MARGIN_SECONDS = 5.0
@@ -209,7 +213,8 @@ class Deliverer:
         self._settings = settings
         self._outbox = Outbox(redis)
         self._targets = targets or Targets(settings)
-        self._under_way: set[asyncio.Task[None]] = set()
+        self._under_way: dict[asyncio.Task[None], str] = {}
+        """Deliveries by the host they go to."""
 
     async def run(self) -> None:
         """Deliver until cancelled; what is under way then is sent again by somebody."""
@@ -229,15 +234,17 @@ class Deliverer:
         if free == 0:
             return False
         lease = self._settings.webhook_timeout_seconds + LEASE_MARGIN_SECONDS
+        busy = Counter(self._under_way.values())
+        claim = partial(self._outbox.claim, lease, free, each=OF_A_HOST, busy=busy)
         try:
-            messages = await to_thread.run_sync(self._outbox.claim, lease, free)
+            messages = await to_thread.run_sync(claim)
         except RedisError as failure:
             log.warning("webhooks are put off", reason=str(failure))
             return False
         for message in messages:
             task = asyncio.create_task(self._deliver(sender, message))
-            self._under_way.add(task)
-            task.add_done_callback(self._under_way.discard)
+            self._under_way[task] = message.host
+            task.add_done_callback(self._under_way.pop)
         return bool(messages)
 
     async def _deliver(self, sender: Sender, message: Message) -> None:

@@ -208,6 +208,10 @@ class AsyncClient:
         """Queue a finished job again, with the same inputs."""
         return await self._run(self._flows.act(job_id, "retry"))
 
+    async def keep(self, job_id: str, ttl: float | None) -> Job:
+        """Have a job kept for some seconds after its end; 0 for ever, None for the usual time."""
+        return await self._run(self._flows.keep(job_id, ttl))
+
     async def delete(self, job_id: str) -> None:
         """Remove a job with its files, stopping it where it runs."""
         await self._run(self._flows.delete(f"/v1/jobs/{job_id}"))

@@ -324,6 +324,18 @@ class Client:
         """Queue a finished job again, with the same inputs."""
         return self._run(self._flows.act(job_id, "retry"))
 
+    def keep(self, job_id: str, ttl: float | None) -> Job:
+        """Have a job kept for some seconds after its end, which may be over already.
+
+        Parameters
+        ----------
+        job_id : str
+            Its id.
+        ttl : float or None
+            Seconds; 0 for ever, None for the service's own time.
+        """
+        return self._run(self._flows.keep(job_id, ttl))
+
     def delete(self, job_id: str) -> None:
         """Remove a job with its files, stopping it where it runs."""
         self._run(self._flows.delete(f"/v1/jobs/{job_id}"))

@@ -268,6 +268,12 @@ class Flows:
         answer = yield from self._request("POST", f"/v1/jobs/{job_id}/{action}")
         return Job.model_validate_json(answer.content)
 
+    def keep(self, job_id: str, ttl: float | None) -> Flow[Job]:
+        """Set the time to live of a job."""
+        call = Call("PATCH", f"/v1/jobs/{job_id}", {}, {"json": {"ttl": ttl}})
+        answer = yield from self._insist(lambda: call)
+        return Job.model_validate_json(answer.content)
+
     def delete(self, url: str) -> Flow[None]:
         """Remove a job or a batch."""
         yield from self._request("DELETE", url)

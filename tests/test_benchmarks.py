@@ -69,3 +69,11 @@ def test_missing_data(tmp_path: Path) -> None:
     assert errors["wrong"] == 0.0
     for spoilt in (gaps, errors):
         assert spoilt["e3d"] < clean["e3d"] + 1e-3
+
+
+def test_a_batch_is_looked_at_and_dealt_with() -> None:
+    rows = run("batches.py", "--jobs", "30")
+    assert rows[0][:2] == ["30", "jobs"]
+    measured = [" ".join(row).split("|")[2] for row in rows[3:]]
+    assert len(measured) == 9
+    assert all(int(milliseconds) >= 0 for milliseconds in measured)

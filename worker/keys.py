@@ -12,6 +12,7 @@ import hashlib
 import hmac
 import re
 import secrets
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -49,6 +50,10 @@ class ApiKey:
         Queued and running jobs that its owner may have for this key to add one; 0 for any.
     stored_bytes : int or None
         Bytes that its owner may store for this key to add some; 0 for any.
+    streams : int or None
+        Streams of events that it may have open at a time in each API process; 0 for any number.
+    expires_at : float or None
+        Unix seconds from which on it is refused; None for never.
     """
 
     id: str
@@ -58,9 +63,15 @@ class ApiKey:
     requests_per_minute: int | None = None
     jobs: int | None = None
     stored_bytes: int | None = None
+    streams: int | None = None
+    expires_at: float | None = None
+
+    def expired(self, now: float) -> bool:
+        """Whether its time is over."""
+        return self.expires_at is not None and now >= self.expires_at
 
 
-_LIMITS = ("requests_per_minute", "jobs", "stored_bytes")
+_LIMITS = ("requests_per_minute", "jobs", "stored_bytes", "streams")
 
 
 class KeyStore:
@@ -83,6 +94,8 @@ class KeyStore:
         requests_per_minute: int | None = None,
         jobs: int | None = None,
         stored_bytes: int | None = None,
+        streams: int | None = None,
+        expires_at: float | None = None,
     ) -> tuple[ApiKey, str]:
         """Make a key; return what is kept of it, and the key itself, which can never be had again.
 
@@ -106,6 +119,8 @@ class KeyStore:
             requests_per_minute=requests_per_minute,
             jobs=jobs,
             stored_bytes=stored_bytes,
+            streams=streams,
+            expires_at=expires_at,
         )
         fields: dict[Any, str | float] = {
             "owner": owner,
@@ -116,6 +131,8 @@ class KeyStore:
         for name in _LIMITS:
             if (limit := getattr(key, name)) is not None:
                 fields[name] = limit
+        if expires_at is not None:
+            fields["expires_at"] = f"{expires_at:.6f}"
         with self._redis.pipeline() as pipe:
             pipe.hset(_place(key_id), mapping=fields)
             pipe.zadd(_INDEX, {key_id: key.created_at})
@@ -143,7 +160,7 @@ class KeyStore:
 
 
 async def find_key(redis: redis.asyncio.Redis, given: str) -> ApiKey | None:
-    """Return the key that a request gave, or None when there is no such key.
+    """Return the key that a request gave, expired or not; None when there is no such key.
 
     Nothing is remembered from one call to the next, so a revoked key is refused at once.
 
@@ -162,6 +179,12 @@ async def find_key(redis: redis.asyncio.Redis, given: str) -> ApiKey | None:
     if not hmac.compare_digest(_hash(parts["secret"]), expected) or not fields:
         return None
     return _decode(parts["id"], fields)
+
+
+async def is_valid(redis: redis.asyncio.Redis, key_id: str) -> bool:
+    """Whether a key that was good for a request still is: neither revoked nor expired."""
+    fields = await cast("Awaitable[dict[bytes, bytes]]", redis.hgetall(_place(key_id)))
+    return bool(fields) and not _decode(key_id, fields).expired(time.time())
 
 
 def _hash(secret: str) -> str:
@@ -183,4 +206,6 @@ def _decode(key_id: str, fields: Mapping[bytes, bytes]) -> ApiKey:
         requests_per_minute=limits["requests_per_minute"],
         jobs=limits["jobs"],
         stored_bytes=limits["stored_bytes"],
+        streams=limits["streams"],
+        expires_at=float(texts["expires_at"]) if "expires_at" in texts else None,
     )

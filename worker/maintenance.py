@@ -17,11 +17,16 @@ from worker.storage import StorageError
 from worker.uploads import UploadStore, folder_prefix
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from redis import Redis
 
     from worker.queue import JobQueue
 
 ORPHAN_LOOK_SECONDS = 3600.0
+PUT_OFF_SECONDS = 60.0
+FAILURES = 3
+"""After so many the whole storage is taken to be away; the rest waits for the next time."""
 
 _OBJECT = re.compile(r"(?P<kind>uploads|results|incoming)/(?P<job>[^/]+)/(?:(?P<attempt>\d+)/)?")
 
@@ -82,46 +87,74 @@ class Maintenance:
 
     def expire_uploads(self) -> None:
         """Remove the objects of uploads that nobody went on with and no job took."""
-        storage, count, size = self.queue.storage, 0, 0
-        for folder in self.uploads.abandoned():
-            prefix = folder_prefix(folder)
-            found = list(storage.list_prefix(prefix))
-            storage.delete_prefix(prefix)
-            self.uploads.forget_folder(folder)
-            count += bool(found)
-            size += sum(item.bytes for item in found)
-        if count:
-            log.info("abandoned uploads removed", count=count, bytes=size)
-        self._removed("abandoned_upload", count)
+        prefixes = {folder: folder_prefix(folder) for folder in self.uploads.abandoned()}
+        self._empty(
+            "abandoned_upload", prefixes, self.uploads.forget_folder, self.uploads.put_off_folder
+        )
 
     def collect_garbage(self) -> None:
         """Remove the objects of deleted jobs and of attempts that came to nothing."""
-        storage, count, size = self.queue.storage, 0, 0
-        for prefix in self.queue.records.garbage():
-            found = list(storage.list_prefix(prefix))
-            storage.delete_prefix(prefix)
-            self.queue.records.forget_garbage(prefix)
+        records = self.queue.records
+        prefixes = {prefix: prefix for prefix in records.garbage()}
+        self._empty("garbage", prefixes, records.forget_garbage, records.put_off_garbage)
+
+    def _empty(
+        self,
+        kind: str,
+        prefixes: Mapping[str, str],
+        forget: Callable[[str], None],
+        put_off: Callable[[str, float], None],
+    ) -> None:
+        """Remove all objects under prefixes; one that cannot be emptied does not hold up others.
+
+        Parameters
+        ----------
+        kind : str
+            As what they are counted.
+        prefixes : mapping of str to str
+            By the name under which Redis knows each.
+        forget, put_off : callable
+            Notes that nothing is left; that it is to be tried again after some seconds.
+        """
+        storage, count, size, failures = self.queue.storage, 0, 0, 0
+        for name, prefix in prefixes.items():
+            try:
+                found = list(storage.list_prefix(prefix))
+                storage.delete_prefix(prefix)
+            except StorageError as error:
+                log.warning("objects are left for later", prefix=prefix, reason=str(error))
+                put_off(name, PUT_OFF_SECONDS)
+                failures += 1
+                if failures == FAILURES:
+                    break
+                continue
+            forget(name)
             count += bool(found)
             size += sum(item.bytes for item in found)
         if count:
-            log.info("garbage removed", count=count, bytes=size)
-        self._removed("garbage", count)
+            log.info("objects removed", kind=kind, count=count, bytes=size)
+        self._removed(kind, count)
 
     def collect_orphans(self) -> None:
-        """Once an hour, remove old objects that no record knows.
+        """Once an hour, remove old objects that no record knows, and tickets of no job.
 
-        Such are uploads whose client went away before there was a job, and results of an attempt
-        that wrote on after it had been given up.
+        Such objects are uploads whose client went away before there was a job, and results of an
+        attempt that wrote on after it had been given up.
         """
         settings = self.queue.settings
         period = min(ORPHAN_LOOK_SECONDS, settings.orphan_grace_seconds)
         if self.queue.redis.set(f"{PREFIX}:orphans", 1, nx=True, px=int(period * 1000)):
-            count = 0
-            for prefix in self._orphans(time.time() - settings.orphan_grace_seconds):
-                log.info("objects of no job removed", prefix=prefix)
-                self.queue.storage.delete_prefix(prefix)
-                count += 1
-            self._removed("orphan", count)
+            self.queue.sweep_tickets()
+            orphans = self._orphans(time.time() - settings.orphan_grace_seconds)
+            for prefix in orphans:
+                log.info("objects of no job are removed", prefix=prefix)
+            # What cannot be removed now is an orphan the next time, too.
+            self._empty(
+                "orphan",
+                {o: o for o in orphans},
+                lambda _prefix: None,
+                lambda _prefix, _seconds: None,
+            )
 
     def _orphans(self, before: float) -> list[str]:
         """Return prefixes without a record, none of whose objects changed after a time."""

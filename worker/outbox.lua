@@ -16,6 +16,7 @@ redis.replicate_commands() -- Redis 6 needs it to write after TIME; later ones d
 
 local prefix, step = KEYS[1] .. ':', ARGV[1]
 local outbox, counters = prefix .. 'webhooks', prefix .. 'counters'
+local looked_at, put_off_seconds = 1000, 5
 
 local time = redis.call('TIME')
 local now = tonumber(time[1]) + tonumber(time[2]) / 1e6
@@ -41,18 +42,34 @@ end
 
 local steps = {}
 
--- lease seconds, most messages -> {{message, attempt, fields and values of the snapshot}, ...}
-function steps.claim(lease, most)
-  local claimed = {}
-  local due = redis.call('ZRANGEBYSCORE', outbox, '-inf', stamp(now), 'LIMIT', 0, most)
+-- lease seconds, most messages, most of a host, how many of each host the caller has (JSON)
+-- -> {{message, attempt, fields and values of the snapshot}, ...}
+-- Messages of hosts that have enough are passed over. Where so many of them are due that others
+-- might never be looked at, they are put off.
+function steps.claim(lease, most, each, busy)
+  local claimed, passed = {}, {}
+  busy = cjson.decode(busy)
+  local due = redis.call('ZRANGEBYSCORE', outbox, '-inf', stamp(now), 'LIMIT', 0, looked_at)
   for _, message in ipairs(due) do
     local key = prefix .. 'webhook:' .. message
-    if redis.call('EXISTS', key) == 0 then
+    local url = redis.call('HGET', key, 'webhook')
+    local host = url and url:match('^%a+://([^/?#]*)'):lower()
+    if #claimed == tonumber(most) then
+      break
+    elseif not url then
       redis.call('ZREM', outbox, message)
+    elseif (busy[host] or 0) >= tonumber(each) then
+      passed[#passed + 1] = message
     else
+      busy[host] = (busy[host] or 0) + 1
       redis.call('ZADD', outbox, stamp(now + lease), message)
       local attempt = redis.call('HINCRBY', key, 'attempts', 1)
       claimed[#claimed + 1] = { message, attempt, redis.call('HGETALL', key) }
+    end
+  end
+  if #due == looked_at then
+    for _, message in ipairs(passed) do
+      redis.call('ZADD', outbox, stamp(now + put_off_seconds), message)
     end
   end
   return claimed

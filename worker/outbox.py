@@ -7,13 +7,17 @@ two processes send one at the same time, and another takes over where one dies.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast, get_args
+from urllib.parse import urlsplit
 
 from worker.records import PREFIX, JobRecord, decode
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from redis import Redis
 
 Outcome: TypeAlias = Literal["delivered", "failed", "given_up"]
@@ -43,6 +47,11 @@ class Message:
     url: str
     record: JobRecord
 
+    @property
+    def host(self) -> str:
+        """Host and port of the address, as `outbox.lua` tells hosts apart."""
+        return urlsplit(self.url).netloc.lower()
+
 
 class Outbox:
     """Messages in Redis; calls block.
@@ -60,7 +69,14 @@ class Outbox:
     def _step(self, step: str, *arguments: str | float) -> Any:
         return self._script(keys=[PREFIX], args=[step, *arguments])
 
-    def claim(self, lease: float, limit: int) -> list[Message]:
+    def claim(
+        self,
+        lease: float,
+        limit: int,
+        *,
+        each: int | None = None,
+        busy: Mapping[str, int] | None = None,
+    ) -> list[Message]:
         """Take messages that are due; nobody else gets them for some seconds.
 
         Parameters
@@ -69,9 +85,14 @@ class Outbox:
             Seconds after which a message that was not settled is due again.
         limit : int
             Most messages.
+        each : int, optional
+            Most messages of one host, those included that the caller is busy with.
+        busy : mapping of str to int, optional
+            Number of these by host (`Message.host`).
         """
         messages = []
-        for message_id, attempt, flat in self._step("claim", lease, limit):
+        known = json.dumps(dict(busy or {}))
+        for message_id, attempt, flat in self._step("claim", lease, limit, each or limit, known):
             found = dict(zip(flat[::2], flat[1::2], strict=True))
             record = decode(found[b"of_job"].decode(), found)
             if record is not None and record.webhook is not None:

@@ -70,6 +70,11 @@ class ProgressReporter:
         """Put T and N into the record with the next report."""
         self._size = {"frames": frames, "points": points}
 
+    def due(self, stage: str) -> bool:
+        """Whether it is time for a report of a stage; solvers call back thousands of times."""
+        new_stage = stage != self._last.stage and not self._failing
+        return new_stage or time.monotonic() >= self._next
+
     def __call__(self, progress: Progress) -> bool:
         """Report, if it is time to; False when the job was asked to stop.
 
@@ -78,10 +83,9 @@ class ProgressReporter:
         AttemptOver
             The job is no longer this attempt's.
         """
-        now = time.monotonic()
-        new_stage = progress.stage != self._last.stage and not self._failing
-        if now < self._next and not new_stage:
+        if not self.due(progress.stage):
             return True
+        now = time.monotonic()
         residual = progress.residual
         if residual is not None and not math.isfinite(residual):
             residual = None

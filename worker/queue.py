@@ -7,6 +7,7 @@ a queued record that has none, and a second ticket finds that its job is taken.
 
 from __future__ import annotations
 
+import re
 import uuid
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
@@ -51,6 +52,10 @@ FORMER_TICKET_TTL = 600
 
 _LATE_WRITER_SECONDS = 15.0
 """After a deletion a worker that has not noticed may write for a while; look again after that."""
+
+_KEY_OF_A_TICKET = re.compile(
+    r"rq:(?:job|executions|results):(?P<ticket>(?P<job>[0-9a-f]{32})-[0-9a-f]{12})(?::.*)?"
+)
 
 log = structlog.get_logger(__name__)
 
@@ -294,6 +299,34 @@ class JobQueue:
             # InvalidJobOperation: its worker has just finished and removed it.
             # ValueError: the execution's own hash has expired before its entry in the registry.
             self.redis.delete(Job.key_for(ticket))
+
+    def sweep_tickets(self) -> int:
+        """Have RQ forget what it keeps of tickets that lead nowhere; return how many keys.
+
+        RQ writes to a ticket without asking whether it is still there. Where it was removed just
+        before, and the worker dies before it notices, that would stay for ever.
+        """
+        found = {
+            key: match
+            for key in self.redis.scan_iter("rq:*", count=1000)
+            if (match := _KEY_OF_A_TICKET.fullmatch(key.decode()))
+        }
+        with self.redis.pipeline(transaction=False) as pipe:
+            for key, match in found.items():
+                pipe.ttl(key)
+                pipe.hget(record_key(match["job"]), "ticket")
+            answers = pipe.execute()
+            stale = [
+                key
+                for (key, match), ttl, current in zip(
+                    found.items(), answers[::2], answers[1::2], strict=True
+                )
+                if ttl == -1 and current != match["ticket"].encode()
+            ]
+            for key in stale:  # not at once: some worker may have begun with it a moment ago
+                pipe.expire(key, FORMER_TICKET_TTL)
+            pipe.execute()
+        return len(stale)
 
     # Many at once
 

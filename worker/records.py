@@ -524,6 +524,10 @@ class RecordStore:
         """Note that nothing is left under a storage prefix."""
         self.redis.zrem(f"{PREFIX}:garbage", prefix)
 
+    def put_off_garbage(self, prefix: str, seconds: float) -> None:
+        """Have a storage prefix that could not be emptied looked at again after some seconds."""
+        self.redis.zadd(f"{PREFIX}:garbage", {prefix: self._now() + seconds}, xx=True)
+
     def sign_of_life(self, worker: str, forget_seconds: float = 3600) -> None:
         """Note that a worker process lives."""
         now = self._now()
@@ -706,6 +710,18 @@ class RecordStore:
         """Make a finished job queued again; 'busy' where its owner has too many active ones."""
         most = "" if allowance.jobs is None else allowance.jobs
         return cast("Literal['ok']", self._step("retry", job_id, most).decode())
+
+    def keep(self, job_id: str, ttl: float | None) -> bool:
+        """Have a job kept for some seconds after its end; False when there is no such job.
+
+        Parameters
+        ----------
+        job_id : str
+        ttl : float or None
+            0 keeps it for ever; None for the time that holds for all.
+        """
+        own = "" if ttl is None else ttl
+        return bool(self._step("keep", job_id, own, self.result_ttl) == b"ok")
 
     def forget_inputs(self, job_id: str) -> None:
         """Note that the files of a job's inputs are gone."""

@@ -161,6 +161,12 @@ class Settings(BaseSettings):
         ge=0,
         description="Bytes that the owner of an API key that says no other may store; 0 for any.",
     )
+    key_streams: int = Field(
+        default=32,
+        ge=0,
+        description="Streams of events that an API key that says no other may have open at a time "
+        "in each API process; 0 for any number.",
+    )
     metrics_token: str | None = Field(
         default=None,
         min_length=16,

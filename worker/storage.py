@@ -19,7 +19,7 @@ import uuid
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
@@ -552,31 +552,32 @@ async def _write_file(target: Path, meter: _Meter, chunks: AsyncIterable[bytes])
     with staged.open("xb", buffering=0) as file:
         guard = threading.Lock()  # held by a thread that writes, which a cancelled task leaves
 
-        unsynced = 0
-
-        def write(block: bytes) -> None:
-            nonlocal unsynced
+        def take(block: bytes) -> None:
+            meter.sha256.update(block)  # here, while it is in the processor's cache
             with guard:
                 left = memoryview(block)
                 while left and not file.closed:
                     left = left[file.write(left) :]
-                unsynced += len(block)
-                if (
-                    unsynced >= SYNC_BYTES and not file.closed
-                ):  # a little work often, none to wait for
-                    os.fdatasync(file.fileno())
-                    unsynced = 0
 
+        loop = asyncio.get_running_loop()
         try:
-            writing: asyncio.Future[Any] | None = None
+            writing: asyncio.Future[None] | None = None
+            syncing: asyncio.Future[None] | None = None
+            unsynced = 0
             async for block in meter.count(chunks):
                 if writing is not None:
                     await writing
-                writing = asyncio.gather(
-                    asyncio.to_thread(write, block), asyncio.to_thread(meter.sha256.update, block)
-                )
+                # Beside the arrival of more, so that little is left to wait for at the end.
+                if unsynced >= SYNC_BYTES and (syncing is None or syncing.done()):
+                    if syncing is not None:
+                        syncing.result()
+                    syncing, unsynced = _begin_sync(file.fileno()), 0
+                writing = loop.run_in_executor(None, take, block)
+                unsynced += len(block)
             if writing is not None:
                 await writing
+            if syncing is not None:
+                await asyncio.shield(syncing)
             await asyncio.to_thread(os.fsync, file.fileno())
             staged.replace(target)
             await asyncio.to_thread(_sync, target.parent)
@@ -585,6 +586,22 @@ async def _write_file(target: Path, meter: _Meter, chunks: AsyncIterable[bytes])
                 file.close()
             staged.unlink(missing_ok=True)
             raise
+
+
+def _begin_sync(descriptor: int) -> asyncio.Future[None]:
+    """Begin to put on disk what a file has; it may be closed meanwhile, and nobody need wait."""
+    own = os.dup(descriptor)
+
+    def sync() -> None:
+        try:
+            os.fdatasync(own)
+        finally:
+            os.close(own)
+
+    syncing = asyncio.get_running_loop().run_in_executor(None, sync)
+    # Where the upload has failed for another reason nobody asks for the outcome.
+    syncing.add_done_callback(lambda done: None if done.cancelled() else done.exception())
+    return syncing
 
 
 def _range(start: int, length: int | None) -> obstore.GetOptions:

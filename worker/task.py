@@ -298,6 +298,8 @@ class _Attempt:
 
     def _solver_progress(self, progress: Progress) -> bool:
         self._trace(progress.stage)
+        if not self.report.due(progress.stage):
+            return True
         return self.report(dataclasses.replace(progress, fraction=SOLVER_SHARE * progress.fraction))
 
     def _trace(self, stage: str) -> None:

@@ -231,6 +231,18 @@ local function notify(job)
   end
 end
 
+-- Sets the end of the time to live of a job that has ended; 0 seconds keep it for ever.
+local function expire(job, finished, ttl)
+  local key = prefix .. 'job:' .. job
+  if ttl > 0 then
+    redis.call('HSET', key, 'expires_at', stamp(finished + ttl))
+    redis.call('ZADD', expiry, stamp(finished + ttl), job)
+  else
+    redis.call('HDEL', key, 'expires_at')
+    redis.call('ZREM', expiry, job)
+  end
+end
+
 -- Ends a job, without counting it. The time to live is the job's own or the one given; 0 keeps it
 -- for ever.
 local function close(job, status, ttl)
@@ -240,10 +252,7 @@ local function close(job, status, ttl)
   redis.call('ZREM', leases, job)
   redis.call('HDEL', key, 'worker', 'suspected_at', 'cancel_requested_at')
   redis.call('HSET', key, 'finished_at', stamp(now))
-  if ttl > 0 then
-    redis.call('HSET', key, 'expires_at', stamp(now + ttl))
-    redis.call('ZADD', expiry, stamp(now + ttl), job)
-  end
+  expire(job, now, ttl)
   tally(job, 'ended', stamp(now))
   if status == 'succeeded' then
     tally(job, 'e3d', e3d or nil)
@@ -705,6 +714,26 @@ function steps.delete(only_expired, again)
   end
   redis.call('PUBLISH', prefix .. 'changed:' .. id, 'deleted ' .. (owner or ''))
   return { 'ok', ticket or '', unpack(unwanted) }
+end
+
+-- seconds to keep the job after its end ('' for the time that holds for all), that time
+-- -> 'ok' | 'gone'
+function steps.keep(own, ttl)
+  if not read(record, 'status') then
+    return 'gone'
+  end
+  if own == '' then
+    redis.call('HDEL', record, 'ttl')
+  else
+    redis.call('HSET', record, 'ttl', own)
+    ttl = own
+  end
+  local finished = read(record, 'finished_at')
+  if finished then
+    expire(id, finished, tonumber(ttl))
+  end
+  changed(id)
+  return 'ok'
 end
 
 -- -> 'ok'; the files of the job's inputs are gone, the record stays

@@ -6,7 +6,8 @@
 -- Keys, all under the prefix:
 --   upload:{owner}:{id}          hash: the record, which Redis removes at the end of its time to live
 --   upload:{owner}:{id}:parts    list of the objects that hold the bytes, where there are several
---   uploads@{owner}              sorted set of ids by time of creation
+--   uploads@{owner}              sorted set of ids by time of creation; it lives as long as the record
+--                                that lives longest, and new uploads push out those that are over
 --   incoming                     sorted set of storage folders by the time they are to be removed;
 --                                a folder stands here before the first byte is written to it
 --   job:{id}                     read only: whether a job that took an upload exists
@@ -38,12 +39,31 @@ local function read(field, key)
   return redis.call('HGET', key or record, field) or nil
 end
 
+-- Has the index live for so long at least.
+local function keep_index(milliseconds)
+  if redis.call('PTTL', index) < milliseconds then
+    redis.call('PEXPIRE', index, milliseconds)
+  end
+end
+
+-- Puts an upload into the index, and takes out some of the oldest whose time was over.
+local function enlist(upload, created)
+  for _, old in ipairs(redis.call('ZRANGE', index, 0, 9)) do
+    if redis.call('EXISTS', key_of(old)) == 0 then
+      redis.call('ZREM', index, old)
+    end
+  end
+  redis.call('ZADD', index, created, upload)
+  keep_index(redis.call('PTTL', key_of(upload)))
+end
+
 -- Keeps a record and its folder for another while.
 local function extend(ttl)
   local milliseconds = math.ceil(tonumber(ttl) * 1000)
   redis.call('HSET', record, 'expires_at', stamp(now + tonumber(ttl)))
   redis.call('PEXPIRE', record, milliseconds)
   redis.call('PEXPIRE', parts, milliseconds)
+  keep_index(milliseconds)
   redis.call('ZADD', incoming, stamp(now + tonumber(ttl)), read('folder'))
 end
 
@@ -71,8 +91,8 @@ function steps.create(ttl, folder, ...)
   end
   redis.call('HSET', record, 'folder', folder, 'created_at', stamp(now), 'offset', 0, 'token', 0,
     ...)
-  redis.call('ZADD', index, stamp(now), id)
   extend(ttl)
+  enlist(id, stamp(now))
   return 'ok'
 end
 
@@ -89,8 +109,8 @@ function steps.replace(ttl, folder, ...)
   local token, created = read('token') or 0, read('created_at') or stamp(now)
   redis.call('DEL', record, parts)
   redis.call('HSET', record, 'folder', folder, 'created_at', created, 'token', token + 1, ...)
-  redis.call('ZADD', index, created, id)
   extend(ttl)
+  enlist(id, created)
   if former then
     redis.call('ZADD', incoming, stamp(now), former)
   end
@@ -199,7 +219,7 @@ function steps.give_back(job, ...)
     if read('job', key) == job then
       redis.call('HSET', key, 'former_place', job .. '/' .. read('taken_as', key))
       redis.call('HDEL', key, 'job', 'taken_as', 'taken_at')
-      redis.call('ZADD', index, read('created_at', key), upload)
+      enlist(upload, read('created_at', key))
       redis.call('ZADD', incoming, read('expires_at', key), read('folder', key))
     end
   end

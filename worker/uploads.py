@@ -321,16 +321,24 @@ class UploadStore:
         """Undo `take`: the job will not be."""
         self._step("give_back", owner, "*", job_id, *upload_ids)
 
+    def _now(self) -> float:
+        seconds, microseconds = self.redis.time()
+        return seconds + microseconds / 1e6
+
     def abandoned(self, limit: int = 100) -> Sequence[str]:
         """Return folders whose time is over."""
-        seconds, microseconds = self.redis.time()
-        now = seconds + microseconds / 1e6
-        due = self.redis.zrangebyscore(f"{PREFIX}:incoming", "-inf", now, start=0, num=limit)
+        due = self.redis.zrangebyscore(
+            f"{PREFIX}:incoming", "-inf", self._now(), start=0, num=limit
+        )
         return [folder.decode() for folder in cast("list[bytes]", due)]
 
     def knows_folder(self, folder: str) -> bool:
         """Whether a folder is to be kept, or to be removed at its time."""
         return self.redis.zscore(f"{PREFIX}:incoming", folder) is not None
+
+    def put_off_folder(self, folder: str, seconds: float) -> None:
+        """Have a folder that could not be emptied looked at again after some seconds."""
+        self.redis.zadd(f"{PREFIX}:incoming", {folder: self._now() + seconds}, xx=True)
 
     def forget_folder(self, folder: str) -> None:
         """Note that nothing is left in a folder."""

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import re
 import time
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,6 +38,8 @@ DataDir = Annotated[
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 _UNITS |= {f"{unit}i": 1 << (10 * power) for power, unit in enumerate("KMGT", start=1)}
 
+_SECONDS = {"h": 3600, "d": 86400, "w": 7 * 86400}
+
 keys = typer.Typer(no_args_is_help=True, help="Make, list and revoke API keys of this service.")
 
 
@@ -46,6 +49,22 @@ def _bytes(text: str) -> int:
     if found is None:
         raise typer.BadParameter(f"{text!r} is no number of bytes such as 500M or 20GiB.")
     return int(float(found[1]) * _UNITS[found[2] or ""])
+
+
+def _moment(text: str) -> float:
+    """Read a moment to come, such as 90d, 12h or 2027-01-31; return it in Unix seconds."""
+    if found := re.fullmatch(r"(\d{1,6})([hdw])", text.strip()):
+        moment = time.time() + int(found[1]) * _SECONDS[found[2]]
+    else:
+        try:
+            moment = datetime.fromisoformat(text.strip()).timestamp()
+        except (ValueError, OverflowError):
+            raise typer.BadParameter(
+                f"{text!r} is neither a time such as 90d or 12h nor a date such as 2027-01-31."
+            ) from None
+    if moment <= time.time():
+        raise typer.BadParameter(f"{text!r} is over.")
+    return moment
 
 
 @keys.command()
@@ -84,15 +103,38 @@ def create(
             "[default: SMSR_KEY_STORED_BYTES]",
         ),
     ] = None,
+    streams: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Streams of events open at a time in each API process, 0 for any number. "
+            "[default: SMSR_KEY_STREAMS]",
+        ),
+    ] = None,
+    expires: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHEN",
+            help="End of its time: 90d, 12h or a date such as 2027-01-31. [default: never]",
+        ),
+    ] = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a key and print it, this once: only its hash is kept."""
     size = None if storage is None else _bytes(storage)
+    end = None if expires is None else _moment(expires)
     with _store(data_dir) as store:
         try:
             made, key = store.create(
-                owner, note=note, requests_per_minute=requests, jobs=jobs, stored_bytes=size
+                owner,
+                note=note,
+                requests_per_minute=requests,
+                jobs=jobs,
+                stored_bytes=size,
+                streams=streams,
+                expires_at=end,
             )
         except ValueError as error:
             complain(str(error))
@@ -113,7 +155,7 @@ def list_keys(data_dir: DataDir = None, as_json: AsJson = False) -> None:
         console.print_json(data=[dataclasses.asdict(key) for key in found])
         return
     table = Table(
-        "key", "owner", "created", "requests/min", "jobs", "bytes", "note",
+        "key", "owner", "created", "expires", "requests/min", "jobs", "bytes", "streams", "note",
         header_style="bold", box=None,
     )  # fmt: skip
     for key in found:
@@ -167,6 +209,13 @@ def _row(key: ApiKey) -> tuple[str, ...]:
     def limit(number: int | None) -> str:
         return "default" if number is None else str(number) if number else "any"
 
-    created = time.strftime("%Y-%m-%d %H:%M", time.localtime(key.created_at))
-    numbers = (limit(n) for n in (key.requests_per_minute, key.jobs, key.stored_bytes))
-    return (key.id, key.owner, created, *numbers, escape(key.note))
+    expires = "never" if key.expires_at is None else _date(key.expires_at)
+    if key.expired(time.time()):
+        expires = f"[red]{expires}[/]"
+    given = (key.requests_per_minute, key.jobs, key.stored_bytes, key.streams)
+    numbers = (limit(number) for number in given)
+    return (key.id, key.owner, _date(key.created_at), expires, *numbers, escape(key.note))
+
+
+def _date(seconds: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(seconds))

@@ -433,6 +433,33 @@ def retry(
 
 
 @jobs.command()
+def keep(
+    job_id: JobId,
+    ttl: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            metavar="SECONDS",
+            help="From its end on, 0 for ever. [default: the service's own time]",
+            show_default=False,
+        ),
+    ] = None,
+    server: Server = LOCAL_SERVER,
+    api_key: ApiKey = None,
+    patience: Patience = 5.0,
+) -> None:
+    """Have a job kept longer or shorter than it is."""
+    with Client(server, patience=patience, api_key=api_key) as client:
+        job = client.keep(job_id, ttl)
+    if job.expires_at is not None:
+        console.print(f"{job.id} is kept until {job.expires_at.astimezone():%Y-%m-%d %H:%M:%S}")
+    elif job.status in FINAL:
+        console.print(f"{job.id} is kept for ever")
+    else:
+        console.print(f"{job.id} is kept for its time once it has ended")
+
+
+@jobs.command()
 def delete(
     job_ids: Annotated[list[str], typer.Argument(metavar="ID...", show_default=False)],
     server: Server = LOCAL_SERVER,

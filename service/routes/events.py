@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Header, Request, Response
@@ -17,10 +19,11 @@ from service.schemas import job_document
 from worker.changes import Deletion, Gap
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
     from starlette.types import Receive, Scope, Send
 
+    from service.access import Gate
     from worker.changes import ChangeFeed
     from worker.records import JobRecord
 
@@ -35,22 +38,51 @@ router = APIRouter(prefix="/v1", tags=["events"])
 
 
 class EventStream(EventSourceResponse):
-    """A stream of events that ends when the client or the server goes away.
+    """A stream of events that ends when the client, the server or the client's key goes away.
 
     Parameters
     ----------
+    request : Request
     events : asynchronous iterator of ServerSentEvent
     heartbeat : float
-        Seconds between comments that keep the connection alive.
+        Seconds between comments that keep the connection alive, and between looks at the key.
     """
 
-    def __init__(self, events: AsyncIterator[ServerSentEvent], *, heartbeat: float) -> None:
-        super().__init__(events, ping=heartbeat, sep="\n", send_timeout=SEND_SECONDS)
+    def __init__(
+        self, request: Request, events: AsyncIterator[ServerSentEvent], *, heartbeat: float
+    ) -> None:
+        self._gate: Gate = request.app.state.gate
+        self._key = request.state.key
+        over = partial(self._gate.until_invalid, self._key, heartbeat)
+        super().__init__(_until(over, events), ping=heartbeat, sep="\n", send_timeout=SEND_SECONDS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        with suppress(SendTimeoutError):
+        with self._gate.stream(self._key), suppress(SendTimeoutError):
             await super().__call__(scope, receive, send)
+
+
+async def _until(
+    over: Callable[[], Awaitable[None]], events: AsyncIterator[ServerSentEvent]
+) -> AsyncIterator[ServerSentEvent]:
+    """Pass events on until they end or something is over."""
+    ending, coming = asyncio.ensure_future(over()), None
+    try:
+        while True:
+            coming = asyncio.ensure_future(_next(events))
+            await asyncio.wait({coming, ending}, return_when=asyncio.FIRST_COMPLETED)
+            if not coming.done() or (event := coming.result()) is None:
+                return
+            yield event
+    finally:
+        tasks = [task for task in (ending, coming) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _next(events: AsyncIterator[ServerSentEvent]) -> ServerSentEvent | None:
+    return await anext(events, None)
 
 
 _EVENT = {
@@ -81,7 +113,7 @@ id: 7
     responses={
         200: _stream("Events `job`, and `deleted` where the job is deleted.", _EXAMPLE),
         204: {"description": "The job has ended, and the client has seen so: connect no more."},
-        **example_responses("unknown-job", "queue-unavailable"),
+        **example_responses("unknown-job", "too-many-streams", "queue-unavailable"),
     },
 )
 async def job_events(
@@ -104,6 +136,7 @@ async def job_events(
     if record.final and record.version == known:
         return Response(status_code=204)
     return EventStream(
+        request,
         _of_a_job(shared.feed, job_id, known, root_of(request)),
         heartbeat=shared.settings.event_heartbeat_seconds,
     )
@@ -115,7 +148,7 @@ async def job_events(
     response_class=Response,
     responses={
         200: _stream("Events `refresh`, `job` and `deleted`.", "event: refresh\ndata: {}\n\n"),
-        **example_responses("queue-unavailable"),
+        **example_responses("too-many-streams", "queue-unavailable"),
     },
 )
 async def all_events(request: Request, shared: Shared) -> Response:
@@ -126,6 +159,7 @@ async def all_events(request: Request, shared: Shared) -> Response:
     a client that connects again lists anew.
     """
     return EventStream(
+        request,
         _of_all_jobs(shared.feed, shared.owner, root_of(request)),
         heartbeat=shared.settings.event_heartbeat_seconds,
     )

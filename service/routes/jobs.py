@@ -9,13 +9,20 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
 from service import paging, quotas
+from service.bodies import content_type, read_json
 from service.context import Context, JobId, Shared, root_of, unknown_job
 from service.downloads import diagnostics_of
 from service.idempotency import REPLAYED, ClaimedKey, Digests, claimed
-from service.incoming import is_json, limits_of, read_references, take_references
+from service.incoming import limits_of, read_references, take_references
 from service.problems import Problem, example_responses
 from service.schemas import job_document
-from service.submissions import Label, accept, fingerprint_of, settings_schema
+from service.submissions import (
+    Label,
+    accept,
+    fingerprint_of,
+    read_settings,
+    settings_schema,
+)
 from service.uploads import FILES, receive_submission
 from service.waiting import preferred_wait, wait_until_final
 from service.watermark import watched
@@ -114,6 +121,27 @@ _BODY: dict[str, Any] = {
             },
         },
     }
+}
+
+
+_CHANGES = ("application/json", "application/merge-patch+json")
+"""Media types of a change of a job."""
+
+_CHANGE: dict[str, Any] = {
+    "schema": {
+        "type": "object",
+        "required": ["ttl"],
+        "additionalProperties": False,
+        "properties": {
+            "ttl": {
+                "type": ["number", "null"],
+                "minimum": 0,
+                "description": "Seconds from its end on, 0 for ever, where the service allows "
+                "that; null for the service's own time.",
+            }
+        },
+    },
+    "example": {"ttl": 86400},
 }
 
 
@@ -222,7 +250,7 @@ async def _receive(
     request: Request, shared: Context, job_id: str, key: ClaimedKey | None
 ) -> JobRecord:
     """Make a job of the body; of a repeated one nothing is stored."""
-    if is_json(request.headers):
+    if content_type(request.headers) == "application/json":
         references = await read_references(request, shared)
         fingerprint = references.fingerprint
         if key is not None and key.bound:
@@ -331,6 +359,50 @@ async def _whole_document(request: Request, shared: Context, record: JobRecord) 
         else:
             diagnostics = diagnostics_of(report)
     return job_document(record, root=root_of(request), position=position, diagnostics=diagnostics)
+
+
+@router.patch(
+    "/{job_id}",
+    summary="Keep a job longer or shorter",
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": dict.fromkeys(_CHANGES, _CHANGE),
+        }
+    },
+    responses=example_responses(
+        "malformed-json",
+        "unknown-job",
+        "unsupported-media-type",
+        "unknown-part",
+        "invalid-setting",
+        "queue-unavailable",
+    ),
+)
+async def change_job(request: Request, shared: Shared, job_id: JobId) -> Job:
+    """Set how long a job is kept after its end, before or after that; nothing else can be changed.
+
+    The body is a JSON document with the member `ttl` (RFC 7396). A job that ended longer ago than
+    that is removed within moments.
+    """
+    await shared.record(job_id)
+    kind = content_type(request.headers)
+    if kind not in _CHANGES:
+        raise Problem(
+            "unsupported-media-type",
+            f"A change is sent as {_CHANGES[1]} or {_CHANGES[0]}, not as "
+            f"{kind or 'a body of unknown type'}.",
+            headers={"Accept-Patch": ", ".join(_CHANGES)},  # RFC 5789, section 2.2
+        )
+    document = await read_json(request)
+    if list(document) != ["ttl"]:
+        raise Problem("unknown-part", "The document has one member, `ttl`.", parts=["ttl"])
+    ttl = read_settings(document, shared.settings).ttl
+    kept = await to_thread.run_sync(shared.queue.records.keep, job_id, ttl)
+    record = await shared.feed.get(job_id) if kept else None
+    if record is None:
+        raise unknown_job(job_id)
+    return job_document(record, root=root_of(request))
 
 
 @router.delete(

@@ -23,7 +23,15 @@ from service.access import PUBLIC, policy_for
 from service.app import create_app
 from smsr_client import Client
 from tests.conftest import clean_environment, redis_running, serving
-from tests.service.conftest import Api, api_running, npy, problem, settings_for, submit
+from tests.service.conftest import (
+    Api,
+    api_running,
+    npy,
+    problem,
+    settings_for,
+    submit,
+    wait_for,
+)
 from worker.keys import KeyStore
 from worker.settings import Settings
 
@@ -58,6 +66,7 @@ def guarded_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
             folder,
             redis,
             access="keys",
+            event_heartbeat_seconds=0.3,
             metrics_token="a-token-for-metrics",
             cors_origins="https://app.example.org, https://b.example.org",
         )
@@ -120,6 +129,60 @@ def test_a_revoked_key_is_refused_at_once(guarded: Guarded) -> None:
         answer = client.get("/v1/jobs")
         problem(answer, "unauthorized", 401)
         assert answer.headers["www-authenticate"] == 'Bearer realm="smsr", error="invalid_token"'
+
+
+def test_a_key_is_good_until_its_time_is_over(guarded: Guarded) -> None:
+    _, key = guarded.keys.create("ann", expires_at=time.time() + 1.5)
+    with guarded.api.client(headers={"X-API-Key": key}) as client:
+        assert client.get("/v1/jobs").status_code == 200
+        wait_for(lambda: client.get("/v1/jobs").status_code == 401)
+        document = problem(client.get("/v1/jobs"), "unauthorized", 401)
+        assert "is over" in document["detail"]
+        # Who does not know the key learns nothing of it.
+        other = client.get("/v1/jobs", headers={"X-API-Key": key[:-1] + "x"})
+        assert "is over" not in problem(other, "unauthorized", 401)["detail"]
+    assert guarded.keys.list()[0].expired(time.time())
+
+
+@pytest.mark.parametrize("how", ["revoked", "expired"])
+def test_a_stream_ends_with_its_key(guarded: Guarded, how: str) -> None:
+    made, key = guarded.keys.create("ann", expires_at=time.time() + 2 if how == "expired" else None)
+    began = time.monotonic()
+    with (
+        guarded.api.client(headers={"X-API-Key": key}) as client,
+        client.stream("GET", "/v1/events") as answer,
+    ):
+        lines = answer.iter_lines()
+        assert any("refresh" in line for line in lines)
+        if how == "revoked":
+            guarded.keys.revoke(made.id)
+        assert all(line.startswith((":", "data")) for line in lines if line)
+    assert time.monotonic() - began < 10
+
+
+def test_streams_are_limited_key_by_key(guarded: Guarded) -> None:
+    with (
+        guarded.client("ann", streams=2) as ann,
+        guarded.client("ann") as other,
+        contextlib.ExitStack() as open_,
+    ):
+        for _ in range(2):
+            answer = open_.enter_context(ann.stream("GET", "/v1/events"))
+            assert answer.status_code == 200
+        refused = ann.get("/v1/events")
+        assert problem(refused, "too-many-streams", 429)["limit"] == 2
+        assert int(refused.headers["Retry-After"]) > 0
+        with other.stream("GET", "/v1/events") as answer:
+            assert answer.status_code == 200
+        assert other.head("/v1/events").status_code == 200
+        assert "never awaited" not in guarded.api.log.read_text()
+        open_.close()
+
+        def again() -> bool:
+            with ann.stream("GET", "/v1/events") as answer:
+                return answer.status_code == 200
+
+        wait_for(again)
 
 
 def test_all_keys_of_an_owner_see_its_jobs(
@@ -228,14 +291,13 @@ def ask(client: httpx.Client, operation: Operation, values: Mapping[str, str]) -
     headers = TUS if "upload_id" in operation.parameters else {}
     body = b"x" * 8 if operation.method in ("PUT", "PATCH", "POST") else None
     url = operation.url(values)
-    timeout = httpx.Timeout(30, read=1.5 if operation.template.endswith("/events") else 30)
-    with client.stream(
-        operation.method, url, headers=headers, content=body, timeout=timeout
-    ) as answer:
-        text = bytearray()
-        with contextlib.suppress(httpx.ReadTimeout):
-            for chunk in answer.iter_raw():
-                text += chunk
+    endless = operation.template.endswith("/events")
+    began, text = time.monotonic(), bytearray()
+    with client.stream(operation.method, url, headers=headers, content=body) as answer:
+        for chunk in answer.iter_raw():
+            text += chunk
+            if endless and time.monotonic() - began > 1.0:  # signs of life come all the time
+                break
     return httpx.Response(
         answer.status_code, headers=answer.headers, content=bytes(text), request=answer.request
     )
@@ -533,13 +595,19 @@ def smsr(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str
 
 def test_keys_are_made_while_the_service_runs(local_server: Served) -> None:
     folder = ("--data-dir", str(local_server.data_dir))
-    made = smsr("keys", "create", "ann", "--note", "x", "--storage", "20GiB", *folder)
+    made = smsr(
+        *("keys", "create", "ann", "--note", "x", "--storage", "20GiB", "--expires", "2d"), *folder
+    )
     assert made.returncode == 0, made.stderr
     key = made.stdout.strip()
     key_id = key.split("_")[1]
     assert key_id in made.stderr
     listed = smsr("keys", "list", "--json", *folder).stdout
-    assert json.loads(listed)[0]["stored_bytes"] == 20 << 30
+    (known,) = json.loads(listed)
+    assert known["stored_bytes"] == 20 << 30
+    assert known["expires_at"] - known["created_at"] == pytest.approx(2 * 86400, abs=60)
+    for when in ("yesterday", "2020-01-01", "0d"):
+        assert smsr("keys", "create", "ann", "--expires", when, *folder).returncode == 2
     assert key.split("_")[2] not in listed
     elsewhere = {"Host": "smsr.example.org"}
     with Client(local_server.url, api_key=key) as client:

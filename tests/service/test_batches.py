@@ -6,6 +6,7 @@ import io
 import json
 import time
 import zipfile
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     import httpx
 
     from smsr.synthetic import Example
+
+
+JSON = {"Content-Type": "application/json"}
 
 
 def send(client: httpx.Client, content: bytes, name: str = "w.npy", **data: str) -> httpx.Response:
@@ -169,3 +173,40 @@ def test_a_job_is_kept_for_its_own_time(api: Api, client: httpx.Client, tracks: 
     assert job["ttl"] == 0.5
     wait_for(lambda: client.get(job["links"]["self"]).status_code == 404)
     wait_for(lambda: not any(job["id"] in path for path in api.stored()))
+
+
+def test_a_job_is_kept_longer_or_shorter(api: Api, client: httpx.Client, tracks: bytes) -> None:
+    job = finished(client, send(client, tracks))
+    here = job["links"]["self"]
+    kept = client.patch(here, json={"ttl": 86400}).json()
+    assert kept["ttl"] == 86400
+    ended, due = (datetime.fromisoformat(kept[name]) for name in ("finished_at", "expires_at"))
+    assert (due - ended).total_seconds() == pytest.approx(86400)
+    merge = {"Content-Type": "application/merge-patch+json"}
+    usual = client.patch(here, content=b'{"ttl": null}', headers=merge).json()
+    assert (usual["ttl"], usual["expires_at"]) == (None, job["expires_at"])
+
+    assert client.patch(here, json={"ttl": 0.01}).status_code == 200
+    wait_for(lambda: client.get(here).status_code == 404)
+    wait_for(lambda: not any(job["id"] in path for path in api.stored()))
+    problem(client.patch(here, json={"ttl": 1}), "unknown-job", 404)
+
+
+def test_a_change_that_is_none_is_refused(idle_api: Api, tracks: bytes) -> None:
+    with idle_api.client() as client:
+        here = send(client, tracks, ttl="60").headers["Location"]
+        before = client.get(here).json()
+        for document in ({}, {"name": "x"}, {"ttl": 1, "name": "x"}):
+            problem(client.patch(here, json=document), "unknown-part", 422)
+        for ttl in (-1, "60", True, 1e12, 0, [1]):  # 0: for ever, which the settings do not allow
+            answer = client.patch(here, json={"ttl": ttl})
+            assert problem(answer, "invalid-setting", 422)["setting"] == "ttl"
+        problem(client.patch(here, content=b"{", headers=JSON), "malformed-json", 400)
+        long = b'{"ttl": ' + b" " * 200_000 + b"1}"
+        problem(client.patch(here, content=long, headers=JSON), "malformed-json", 400)
+        answer = client.patch(here, content=b"ttl=1", headers={"Content-Type": "text/plain"})
+        problem(answer, "unsupported-media-type", 415)
+        assert "merge-patch" in answer.headers["accept-patch"]
+        assert client.get(here).json() == before
+        waiting = client.patch(here, json={"ttl": 90}).json()
+        assert (waiting["ttl"], waiting["expires_at"]) == (90, None)

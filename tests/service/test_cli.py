@@ -319,6 +319,10 @@ def test_jobs_are_looked_after(served: Served, example: Path, tmp_path: Path) ->
     (row,) = (line for line in listed.splitlines() if job["id"] in line)
     assert "succeeded" in row
     assert "measurements.npy" in row
+    usual = succeeded(smsr("jobs", "keep", job["id"], *url))
+    longer = succeeded(smsr("jobs", "keep", job["id"], "--ttl", "1000000", *url))
+    assert "is kept until" in usual
+    assert longer > usual, "dates in the order of their digits"
     refused = smsr("jobs", "cancel", job["id"], *url)
     assert refused.returncode == 1
     assert "finished" in refused.stderr

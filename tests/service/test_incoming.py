@@ -6,10 +6,15 @@ import base64
 import hashlib
 import itertools
 import json
+import select
+import shutil
 import signal
 import socket
+import subprocess
 import threading
+import time
 import uuid
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import httpx
@@ -30,13 +35,14 @@ from tests.service.conftest import (
     settings_for,
     wait_for,
 )
-from worker.uploads import Upload, UploadStore
+from worker.records import new_job_id, upload_key
+from worker.uploads import Upload, UploadStore, new_folder
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from smsr.synthetic import Example
     from tests.conftest import RedisProcess
+
+BROWSERS_CLIENT = Path(__file__).resolve().parent.parent / "tus"
 
 MIB = 1 << 20
 TUS = {"Tus-Resumable": "1.0.0"}
@@ -90,8 +96,7 @@ def job_of(client: httpx.Client, **uploads: str) -> httpx.Response:
 
 def stored_bytes(api: Api, job: httpx.Response, role: str = "measurements") -> bytes:
     assert job.status_code == 201, job.text
-    stored = api.objects / "uploads" / str(job.json()["id"]) / role
-    return stored.read_bytes()
+    return api.storage().get(upload_key(job.json()["id"], role))
 
 
 def test_what_is_spoken(client: httpx.Client) -> None:
@@ -145,6 +150,33 @@ def test_the_protocols_own_client_and_a_job_with_three_uploads(
     job = finished(client, answer)
     assert job["status"] == "succeeded"
     assert job["metrics"]["e3d"] < 0.3
+
+
+@pytest.mark.skipif(
+    shutil.which("node") is None or not (BROWSERS_CLIENT / "node_modules").is_dir(),
+    reason="needs node and `npm ci` in tests/tus",
+)
+def test_the_client_of_browsers(client: httpx.Client, api: Api, tmp_path: Path) -> None:
+    content = large(6)
+    path = tmp_path / "w.npy"
+    path.write_bytes(content)
+    command = ["node", "upload.mjs", f"{api.url}/v1/uploads", str(path)]
+    run = subprocess.run(
+        command, cwd=BROWSERS_CLIENT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    told = json.loads(run.stdout)
+    broken = told["broken"]
+    assert broken["stopped"]
+    assert broken["same"]
+    assert broken["from"] >= len(content) / 2, "it began again"
+    for url in (broken["url"], told["whole"], told["posted"]):
+        upload = client.get(url).json()
+        assert upload["complete"]
+        assert upload["name"] == "w.npy"
+        assert upload["sha256"] == hashlib.sha256(content).hexdigest()
+        assert client.delete(url).status_code == 204
+    problem(client.get(told["removed"]), "unknown-upload", 404)
 
 
 def test_an_upload_serves_once(client: httpx.Client, tracks: bytes) -> None:
@@ -384,15 +416,19 @@ def test_of_two_requests_at_once_the_later_one_holds(client: httpx.Client, api: 
     data = large(24)
     url = create(client, len(data))
     hung = begin_patch(api, url, 0, len(data))
-    hung.sendall(data[: 6 * MIB])
-    wait_for(lambda: offset_of(client, url) >= 4 * MIB)
+    hung.sendall(data[: 10 * MIB])  # a bucket gets 8 MiB at a time
+    wait_for(lambda: offset_of(client, url) >= 8 * MIB)
     offset = offset_of(client, url)
-    assert patch(client, url, offset, data[offset : 10 * MIB]).status_code == 204
-    hung.sendall(bytes(10 * MIB))  # other bytes than the right ones, and too late
+    assert patch(client, url, offset, data[offset : 14 * MIB]).status_code == 204
+    late = len(data) - 10 * MIB
+    while late and not select.select([hung], [], [], 0.2)[0]:
+        step = min(late, 2 * MIB)
+        hung.sendall(bytes(step))  # other bytes than the right ones, and too late
+        late -= step
     assert hung.recv(100).startswith(b"HTTP/1.1 409")
     hung.close()
-    assert offset_of(client, url) == 10 * MIB
-    assert patch(client, url, 10 * MIB, data[10 * MIB :]).status_code == 204
+    assert offset_of(client, url) == 14 * MIB
+    assert patch(client, url, 14 * MIB, data[14 * MIB :]).status_code == 204
     assert client.get(url).json()["sha256"] == hashlib.sha256(data).hexdigest()
     assert stored_bytes(api, job_of(client, measurements=url)) == data
 
@@ -500,6 +536,32 @@ def test_abandoned_uploads_expire_and_are_counted(
         assert client.get("/v1/uploads").json() == {"uploads": []}
         assert not list(redis_process.client().scan_iter("smsr:upload*"))
         assert not list(redis_process.client().scan_iter("smsr:incoming"))
+
+
+def begun(owner: str) -> Upload:
+    return Upload(id=new_job_id(), owner=owner, folder=new_folder(), name="w", length=3)
+
+
+def test_what_is_known_of_uploads_goes_with_them(
+    redis_process: RedisProcess, redis_url: str
+) -> None:
+    """A client that leaves uploads behind for months leaves no trace of them in Redis."""
+    client = redis_process.client()
+    brief, long = UploadStore(client, ttl=0.2), UploadStore(client, ttl=60)
+    for _ in range(25):
+        assert brief.create(begun("ann"))
+    kept = begun("ann")
+    assert long.create(kept)
+    assert client.zcard("smsr:uploads@ann") == 26
+    time.sleep(0.3)
+    for _ in range(3):
+        assert brief.create(begun("ann"))
+    assert client.zcard("smsr:uploads@ann") == 4
+    assert [upload.id for upload in brief.list("ann")][-1] == kept.id
+    assert 50 < client.ttl("smsr:uploads@ann") <= 60
+    assert brief.create(begun("bob"))
+    time.sleep(0.3)
+    assert not client.exists("smsr:uploads@bob")
 
 
 def test_uploads_have_owners(redis_process: RedisProcess, redis_url: str) -> None:

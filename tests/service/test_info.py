@@ -26,13 +26,13 @@ def test_info_tells_version_limits_formats_and_options(client: httpx.Client) -> 
     assert options["time_limit"]["minimum"] == 1
 
 
-def test_alive_and_ready(client: httpx.Client, idle_api: Api) -> None:
+def test_alive_and_ready(client: httpx.Client, api: Api, idle_api: Api) -> None:
     assert client.get("/healthz").json() == {"status": "alive"}
     ready = client.get("/readyz").json()
     assert ready["status"] == "ready"
     parts = ("redis", "storage", "disk", "workers", "maintenance")
     assert ready["checks"] == dict.fromkeys(parts, "ok")
-    assert ready["workers"] == 1
+    assert ready["workers"] == api.settings.workers
     with idle_api.client() as idle:
         ready = idle.get("/readyz").json()
         assert (ready["status"], ready["workers"]) == ("ready", 0)

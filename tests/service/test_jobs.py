@@ -206,3 +206,22 @@ def test_jobs_that_do_not_exist(client: httpx.Client) -> None:
     problem(client.post(f"/v1/jobs/{UNKNOWN}/retry"), "unknown-job", 404)
     waited: Any = client.get(f"/v1/jobs/{UNKNOWN}", headers={"Prefer": "wait=20"})
     problem(waited, "unknown-job", 404)
+
+
+def test_a_redis_that_cannot_write_is_as_good_as_away(idle_api: Api, tracks: bytes) -> None:
+    """As with a full disk: what is stored can be read, and nothing new is accepted."""
+    redis = idle_api.redis.client()
+    files = {"measurements": ("t.npy", tracks)}
+    with idle_api.client() as client:
+        job = submit(client, files).headers["Location"]
+        redis.config_set("min-replicas-to-write", 1)
+        try:
+            refused = submit(client, files)
+            problem(refused, "queue-unavailable", 503)
+            assert int(refused.headers["Retry-After"]) > 0
+            problem(client.delete(job), "queue-unavailable", 503)
+            assert client.get(job).json()["status"] == "queued"
+        finally:
+            redis.config_set("min-replicas-to-write", 0)
+        assert client.delete(job).status_code == 204
+    assert not idle_api.stored()

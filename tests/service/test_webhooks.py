@@ -7,18 +7,21 @@ import base64
 import contextlib
 import json
 import queue
+import ssl
 import threading
 import time
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
+import trustme
 from standardwebhooks import Webhook, WebhookVerificationError
 
 from service.targets import Targets
-from service.webhooks import Answer, Sender
+from service.webhooks import AT_ONCE, OF_A_HOST, Answer, Sender
 from tests.conftest import redis_running
 from tests.service.conftest import (
     api_running,
@@ -73,7 +76,7 @@ class Receiver:
 
 
 @contextlib.contextmanager
-def receiving() -> Iterator[Receiver]:
+def receiving(tls: ssl.SSLContext | None = None) -> Iterator[Receiver]:
     told = Receiver("")
 
     class Handler(BaseHTTPRequestHandler):
@@ -98,6 +101,8 @@ def receiving() -> Iterator[Receiver]:
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
+    if tls is not None:
+        server.socket = tls.wrap_socket(server.socket, server_side=True)
     told.url = f"http://127.0.0.1:{server.server_address[1]}/hook?k=1"
     told.held.set()
     thread = threading.Thread(target=server.serve_forever, args=(0.05,))
@@ -395,6 +400,103 @@ def test_another_address_of_the_name_is_tried(receiver: Receiver) -> None:
     port = receiver.url.split("/")[2].partition(":")[2]
     found = ["127.0.0.9", "127.0.0.1"]
     assert sent(f"http://two.example:{port}/", allowing("127.0.0.0/8"), [found]).delivered
+
+
+@dataclass
+class Secured:
+    """A receiver with a certificate, and the names that clients asked it for."""
+
+    receiver: Receiver
+    names: list[str | None]
+
+    @property
+    def port(self) -> str:
+        return self.receiver.url.split("/")[2].partition(":")[2]
+
+
+@contextlib.contextmanager
+def secured(authority: trustme.CA, *names: str, **more: Any) -> Iterator[Secured]:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    authority.issue_cert(*names, **more).configure_cert(context)
+    asked: list[str | None] = []
+    context.sni_callback = lambda _socket, name, _context: asked.append(name)
+    with receiving(context) as receiver:
+        yield Secured(receiver, asked)
+
+
+@pytest.fixture
+def authority(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> trustme.CA:
+    """An authority of the operator's own, as SSL_CERT_FILE names it."""
+    made = trustme.CA()
+    made.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "ca.pem"))
+    return made
+
+
+def test_the_certificate_is_checked_for_the_name_not_the_address(authority: trustme.CA) -> None:
+    settings = allowing("127.0.0.1/32")
+    with secured(authority, "hooks.example") as one:
+        url = f"https://hooks.example:{one.port}/hook"
+        answer = sent(url, settings, [["127.0.0.1"]])
+        assert answer.delivered, answer
+        delivery = one.receiver.next()
+        assert delivery.headers["host"] == f"hooks.example:{one.port}"
+        assert one.names == ["hooks.example"]
+        # An address instead of a name is checked as one, and is no server name (RFC 6066).
+        assert sent(f"https://127.0.0.1:{one.port}/", settings).error == UNVERIFIED
+        assert one.names == ["hooks.example", None]
+        assert one.receiver.got.empty()
+    with secured(authority, "127.0.0.1") as one:
+        assert sent(f"https://127.0.0.1:{one.port}/", settings).delivered
+
+
+UNVERIFIED = "The certificate of the receiver could not be verified."
+
+
+@pytest.mark.parametrize("how", ["other name", "address", "unknown authority", "expired"])
+def test_a_receiver_without_a_good_certificate_learns_nothing(
+    authority: trustme.CA, how: str
+) -> None:
+    names = {"other name": "other.example", "address": "127.0.0.1"}
+    issuer = trustme.CA() if how == "unknown authority" else authority
+    more = {"not_after": datetime(2020, 1, 1, tzinfo=UTC)} if how == "expired" else {}
+    with secured(issuer, names.get(how, "hooks.example"), **more) as one:
+        url = f"https://hooks.example:{one.port}/hook"
+        answer = sent(url, allowing("127.0.0.1/32"), [["127.0.0.1"]])
+        assert (answer.delivered, answer.error) == (False, UNVERIFIED)
+        assert one.receiver.got.empty()
+
+
+def test_a_host_that_does_not_answer_holds_up_no_other(hooked_api: Api, receiver: Receiver) -> None:
+    store = RecordStore(hooked_api.redis.client())
+    with receiving() as silent:
+        silent.held.clear()
+        for _ in range(AT_ONCE + 8):
+            ended(store, silent.url)
+        wait_for(lambda: silent.got.qsize() >= OF_A_HOST)
+        job_id = ended(store, receiver.url)
+        assert receiver.next(5).verified()["data"]["id"] == job_id
+        assert silent.got.qsize() == OF_A_HOST
+        silent.held.set()
+        wait_for(lambda: silent.got.qsize() == AT_ONCE + 8, 30)
+        wait_for(lambda: not hooked_api.redis.client().exists("smsr:webhooks"))
+
+
+def test_many_messages_to_a_busy_host_are_put_off(
+    redis_process: RedisProcess, redis_url: str
+) -> None:
+    client = redis_process.client()
+    store, outbox = RecordStore(client), Outbox(client)
+    for _ in range(1000):
+        ended(store, "https://busy.example/hook")
+    ended(store, "https://Other.example:8443/hook")
+    busy = {"busy.example": 3}
+    assert outbox.claim(20, 10, each=3, busy=busy) == []
+    (found,) = outbox.claim(20, 10, each=3, busy=busy)
+    assert found.host == "other.example:8443"
+    due = client.zcount("smsr:webhooks", "-inf", time.time())
+    assert due == 0, "those of the busy host are due in some seconds"
+    assert client.zcard("smsr:webhooks") == 1001
 
 
 def test_redirects_and_proxies_are_not_followed(

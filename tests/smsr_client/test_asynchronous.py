@@ -81,6 +81,9 @@ async def test_an_event_loop_does_the_same(served: Served, example: Example) -> 
         assert result.metrics is None
         listed = [job.id async for job in client.list(status="succeeded")]
         assert result.job_id in listed
+        kept = await client.keep(result.job_id, 1000)
+        assert kept.ttl == 1000
+        assert kept.expires_at is not None
         await client.delete(result.job_id)
         with pytest.raises(ServiceError) as caught:
             await client.get(result.job_id)

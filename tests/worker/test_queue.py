@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 import pytest
 
 from worker.maintenance import Maintenance, last_maintenance
-from worker.queue import JobQueue
+from worker.queue import FORMER_TICKET_TTL, JobQueue
 from worker.records import PREFIX, JobActive, JobExists, result_prefix, upload_prefix
 
 if TYPE_CHECKING:
@@ -48,6 +48,21 @@ def test_a_job_is_submitted_once(queue: JobQueue, submit: Submitter) -> None:
     with pytest.raises(JobExists):
         queue.submit(record)
     assert queue.length() == 1
+
+
+def test_what_rq_wrote_to_removed_tickets_fades_away(queue: JobQueue, submit: Submitter) -> None:
+    """A worker that is killed at the wrong moment leaves a part of a ticket, for ever."""
+    waiting, ended = submit(), submit()
+    former = queue.records.ticket(ended)
+    queue.delete(ended)
+    queue.redis.hset(f"rq:job:{former}", "last_heartbeat", "now")
+    queue.redis.zadd(f"rq:executions:{former}", {"e": 1})
+    assert queue.sweep_tickets() == 2
+    assert queue.sweep_tickets() == 0
+    times = {key: queue.redis.ttl(key) for key in rq_keys(queue) if former in key}
+    assert len(times) == 2
+    assert all(0 < seconds <= FORMER_TICKET_TTL for seconds in times.values())
+    assert queue.redis.ttl(f"rq:job:{queue.records.ticket(waiting)}") == -1
 
 
 def test_a_crash_between_record_and_ticket_is_repaired(
@@ -173,10 +188,14 @@ def test_maintenance_outlives_a_failing_storage(queue: JobQueue, submit: Submitt
     queue.delete(job_id)
     queue.storage.folder.joinpath("uploads").rmdir()
     queue.storage.folder.joinpath("uploads").write_bytes(b"a file in the way")
-    queue.redis.zadd("smsr:garbage", {f"uploads/{job_id}/": 1})
+    queue.storage.put_bytes("results/x/1/shapes.npy", b"x")
+    queue.redis.zadd("smsr:garbage", {f"uploads/{job_id}/": 1, "results/x/1/": 2})
     Maintenance(queue).run_once()
-    assert queue.redis.zscore("smsr:garbage", f"uploads/{job_id}/") is not None
+    assert (queue.redis.zscore("smsr:garbage", f"uploads/{job_id}/") or 0) > time.time() + 30
+    assert queue.redis.zscore("smsr:garbage", "results/x/1/") is None, "held up by the other"
+    assert list(queue.storage.list_prefix("results/")) == []
     queue.storage.folder.joinpath("uploads").unlink()
+    queue.redis.zadd("smsr:garbage", {f"uploads/{job_id}/": 1})
     Maintenance(queue).run_once()
     assert queue.redis.zscore("smsr:garbage", f"uploads/{job_id}/") is None
 
