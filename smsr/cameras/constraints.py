@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,10 +23,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+@lru_cache(maxsize=32)
+def _upper_triangle(
+    n: int,
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Return rows, columns and weights of the coordinates of symmetric matrices."""
+    rows, columns = np.triu_indices(n)
+    return rows, columns, np.where(rows == columns, 1.0, math.sqrt(2.0))
+
+
 def symmetric_vector(F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the coordinates (..., n (n + 1) / 2) of symmetric matrices (..., n, n)."""
-    rows, columns = np.triu_indices(F.shape[-1])
-    weights = np.where(rows == columns, 1.0, math.sqrt(2.0))
+    rows, columns, weights = _upper_triangle(F.shape[-1])
     vector: NDArray[np.float64] = F[..., rows, columns] * weights
     return vector
 
@@ -33,9 +42,9 @@ def symmetric_vector(F: NDArray[np.float64]) -> NDArray[np.float64]:
 def symmetric_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the symmetric matrix (n, n) of coordinates (n (n + 1) / 2,)."""
     n = (math.isqrt(8 * len(vector) + 1) - 1) // 2
-    rows, columns = np.triu_indices(n)
+    rows, columns, weights = _upper_triangle(n)
     F = np.zeros((n, n))
-    F[rows, columns] = vector * np.where(rows == columns, 1.0, math.sqrt(0.5))
+    F[rows, columns] = vector / weights
     F[columns, rows] = F[rows, columns]
     return F
 

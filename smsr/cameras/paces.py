@@ -28,6 +28,7 @@ _CYCLES = np.arange(0.4, 8.0, 0.05)  # of a swing, over the whole sequence
 _FEWEST_PER_CYCLE = 4.0  # frames
 _FINER = np.linspace(-0.05, 0.05, 21)
 _FRAMES = 400  # as many tell the frequency of a swing
+_EPS = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,16 +72,38 @@ def polynomials(time: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
 
 
 def robust_fit(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the combination of basis functions (T, k) nearest to values (T,), by Huber's loss."""
-    weights = np.ones(len(values))
+    """Return combinations of basis functions that are nearest to values by Huber's loss.
+
+    Parameters
+    ----------
+    basis : ndarray of shape (..., T, k)
+        One or several sets of functions.
+    values : ndarray of shape (T,)
+
+    Returns
+    -------
+    ndarray of shape (..., T)
+    """
+    weights = np.ones(basis.shape[:-1])
     fitted = values
     for _ in range(_ROUNDS):
-        roots = np.sqrt(weights)
-        coefficients = np.linalg.lstsq(basis * roots[:, None], values * roots, rcond=None)[0]
-        fitted = basis @ coefficients
+        fitted = _nearest(basis, values, weights)
         off = np.abs(values - fitted)
-        spread = max(1.4826 * float(np.median(off)), np.finfo(float).tiny)
-        weights = 1.0 / np.maximum(1.0, off / (_OUTLIER * spread))
+        spread = 1.4826 * np.median(off, axis=-1, keepdims=True)
+        weights = 1.0 / np.maximum(1.0, off / np.maximum(_OUTLIER * spread, np.finfo(float).tiny))
+    return fitted
+
+
+def _nearest(
+    basis: NDArray[np.float64], values: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the weighted least-squares fits (..., T), by normal equations: k is small."""
+    weighted = np.swapaxes(basis * weights[..., None], -1, -2)
+    gram = weighted @ basis
+    ridge = _EPS * np.trace(gram, axis1=-2, axis2=-1)[..., None, None] * np.eye(basis.shape[-1])
+    fitted: NDArray[np.float64] = (
+        basis @ np.linalg.solve(gram + ridge, (weighted @ values)[..., None])
+    )[..., 0]
     return fitted
 
 
@@ -89,22 +112,17 @@ def fit_swing(
 ) -> NDArray[np.float64]:
     """Fit a sine, of the best frequency, on top of a polynomial to angles (T,)."""
 
-    def basis(time: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:
-        phase = np.pi * cycles * time
-        return np.column_stack([polynomials(time, degree), np.sin(phase), np.cos(phase)])
+    def bases(time: NDArray[np.float64], cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+        phases = np.pi * cycles[:, None] * time
+        straight = np.broadcast_to(polynomials(time, degree), (*phases.shape, degree + 1))
+        waves = np.stack([np.sin(phases), np.cos(phases)], axis=-1)
+        return np.concatenate([straight, waves], axis=-1)
 
     step = -(-len(angles) // _FRAMES)
     some_time, some = time[::step], angles[::step]
-
-    def rest(cycles: float) -> float:
-        some_basis = basis(some_time, cycles)
-        coefficients = np.linalg.lstsq(some_basis, some, rcond=None)[0]
-        return float(((some - some_basis @ coefficients) ** 2).sum())
-
-    def rest_of_most(cycles: float) -> float:
-        return float(np.abs(some - robust_fit(basis(some_time, cycles), some)).sum())
-
-    most = max(_CYCLES[0], len(angles) / _FEWEST_PER_CYCLE)
-    cycles = min(_CYCLES[most >= _CYCLES].tolist(), key=rest)
-    cycles = min((cycles + _FINER).tolist(), key=rest_of_most)
-    return robust_fit(basis(time, cycles), angles)
+    cycles = _CYCLES[max(_CYCLES[0], len(angles) / _FEWEST_PER_CYCLE) >= _CYCLES]
+    tried = bases(some_time, cycles)
+    rest = ((some - _nearest(tried, some, np.ones(tried.shape[:-1]))) ** 2).sum(axis=-1)
+    cycles = cycles[rest.argmin()] + _FINER
+    rest = np.abs(some - robust_fit(bases(some_time, cycles), some)).sum(axis=-1)
+    return robust_fit(bases(time, cycles[rest.argmin()][None])[0], angles)
