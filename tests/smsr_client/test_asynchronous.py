@@ -189,17 +189,17 @@ async def test_a_failed_job_and_a_time_that_is_over(served: Served, example: Exa
     async with AsyncClient(served.url) as client:
         with pytest.raises(JobFailed, match="do not vary"):
             await client.reconstruct(np.zeros((20, 30)))
+        many = np.random.default_rng(0).standard_normal((400, 3000))
         with pytest.raises(TimeoutError):
-            await client.reconstruct(
-                np.random.default_rng(0).standard_normal((400, 3000)), timeout=0
-            )
+            await client.reconstruct(many, timeout=0, settings={"reuse": False})
 
 
 async def test_waiting_can_be_given_up(served: Served, example: Example) -> None:
     """A cancelled operation leaves nothing open."""
-    many = np.random.default_rng(0).standard_normal((400, 3000))
+    many = np.random.default_rng(1).standard_normal((1000, 1000))
     async with AsyncClient(served.url) as client:
-        job = await client.submit(many)
+        # The result of an equal job would be there at once.
+        job = await client.submit(many, settings={"reuse": False})
         with anyio.move_on_after(0.2) as scope:
             await client.wait(job.id)
         assert scope.cancelled_caught
