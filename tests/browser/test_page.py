@@ -597,6 +597,11 @@ def test_a_job_is_cancelled_and_run_again(visit: Visit, site: Api, files: dict[s
     page = visit.open(f"/#/jobs/{job['id']}")
     expect(page.locator(".badge")).to_contain_text("Running")
     expect(page.locator(".percent")).to_contain_text("%")
+    cancel = page.get_by_role("button", name="Cancel")
+    cancel.evaluate("element => { element.dataset.kept = 'yes' }")
+    detail = page.locator(".progress .help")
+    expect(detail).not_to_have_text(detail.inner_text())
+    expect(cancel, "progress does not replace buttons").to_have_attribute("data-kept", "yes")
     for again in (True, False):
         page.get_by_role("button", name="Cancel").click()
         expect(page.locator(".notice")).to_contain_text("was cancelled")

@@ -6,7 +6,7 @@ import { followJob } from "../events";
 import { bytes, count, exact, label, precise, seconds, sentence, significant } from "../format";
 import { errorPanel, problemPanel } from "../problem";
 import { figuresCard } from "./figures";
-import { actions, badge, batchLink, facts, title } from "./parts";
+import { actions, apartFromProgress, badge, batchLink, facts, title } from "./parts";
 
 export function jobView(id: string, signal: AbortSignal): HTMLElement {
   return new JobView(id, signal).element;
@@ -45,6 +45,7 @@ class JobView {
   private show(job: Job | null): void {
     if (!job) {
       this.viewing.abort();
+      delete this.head.dataset.text;
       replace(this.head, h("h1", {}, "No such job"));
       replace(
         this.body,
@@ -84,6 +85,12 @@ class JobView {
   }
 
   private drawHead(job: Job): void {
+    const text = apartFromProgress(job);
+    if (this.head.dataset.text === text) {
+      this.head.querySelector(".badge")?.replaceWith(badge(job));
+      return;
+    }
+    this.head.dataset.text = text;
     const held = document.activeElement?.closest(".job-head") ? document.activeElement : null;
     const name = held?.getAttribute("title");
     const parts = [
@@ -129,14 +136,15 @@ class JobView {
 
 /** The stages of a run in the usual order; a run may leave some out. */
 const STAGES: Record<string, string> = {
-  reading: "reading the files",
-  completion: "filling in what is not seen",
-  reduction: "reducing to virtual points",
+  opening: "opening the files",
+  reading: "reading the tracks",
+  factorising: "reducing to virtual points",
   cameras: "finding the cameras",
   smoothing: "smoothing the tracks",
   shapes: "finding the shapes",
   writing: "writing the result",
-  evaluation: "comparing with the ground truth",
+  evaluating: "comparing with the ground truth",
+  publishing: "keeping the result",
 };
 
 class Progress {

@@ -5,7 +5,7 @@ import { append, h, replace } from "../dom";
 import { followJobs } from "../events";
 import { ago, count, exact, precise } from "../format";
 import { errorPanel } from "../problem";
-import { actions, badge, batchLink, title } from "./parts";
+import { actions, apartFromProgress, badge, batchLink, title } from "./parts";
 
 const PAGE = 50;
 
@@ -50,9 +50,12 @@ export function jobsView(
     // A row is replaced only where it changed, so that the focus and open menus stay.
     const old = new Map([...rows.children].map((row) => [(row as HTMLElement).dataset.id, row]));
     const wanted = shown.map((job) => {
-      const text = JSON.stringify(job);
+      const text = apartFromProgress(job);
       const known = old.get(job.id) as HTMLElement | undefined;
-      if (known?.dataset.text === text) return known;
+      if (known?.dataset.text === text) {
+        known.querySelector(".badge")?.replaceWith(badge(job));
+        return known;
+      }
       const row = rowOf(job);
       row.dataset.text = text;
       return row;

@@ -24,6 +24,12 @@ export function badge(job: Job): HTMLElement {
   );
 }
 
+/**
+ * All that a job shows but for its progress, which only its badge tells. Where nothing else changed,
+ * buttons have to stay: a press is lost on one that is replaced meanwhile.
+ */
+export const apartFromProgress = (job: Job): string => JSON.stringify({ ...job, progress: null });
+
 export const title = (job: Job): string => job.name ?? `Job ${job.id.slice(0, 8)}`;
 
 /** Names and values; what has no value is left out. */
