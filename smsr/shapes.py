@@ -328,9 +328,9 @@ def estimate_shapes(
         return rigid_shapes(measurements, rotations)
     limits["motion_weight"] = options.motion_weight
     limits["coherent"] = coherent
-    if options.shape_method == "reweighted":
-        return reweighted_shapes(measurements, rotations, **limits)
     found = reweighted_shapes(measurements, rotations, **limits)
+    if options.shape_method == "reweighted":
+        return found
     if simpler is not None and share > 0.0:
         other = reweighted_shapes(measurements, simpler, **limits)
         found = with_mean_depth(found, rotations, other, simpler, share)

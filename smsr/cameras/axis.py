@@ -51,8 +51,7 @@ class AxisFit:
     @property
     def rotations(self) -> NDArray[np.float64]:
         """The turn's cameras (T, 3, 3)."""
-        turned: NDArray[np.float64] = so3.exp(self.angles[:, None] * self.axis) @ self.start
-        return turned
+        return steady_turn(self.angles, self.axis, self.start).steady
 
     def turn(self, angles: NDArray[np.float64] | None = None) -> Turn:
         """Return the turn, or one by other angles (T,) about the same axis."""
@@ -119,7 +118,7 @@ def fit_axis(rotations: NDArray[np.float64]) -> AxisFit:
     along = np.einsum("i,tij,j->t", axis, relative, axis)
     cosines = np.trace(relative, axis1=1, axis2=2) - along
     angles = np.unwrap(np.arctan2(sines @ axis, cosines))
-    turned = so3.exp(angles[:, None] * axis) @ start
+    turned = steady_turn(angles, axis, start).steady
     return AxisFit(axis, start, angles, so3.log(rotations @ turned.transpose(0, 2, 1)))
 
 

@@ -6,7 +6,6 @@ the axis n of the nod fixed in the camera.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -43,13 +42,15 @@ class GimbalFit:
     axis: AxisFit
 
 
-def fit_gimbal(rotations: NDArray[np.float64]) -> GimbalFit:
+def fit_gimbal(rotations: NDArray[np.float64], axis: AxisFit) -> GimbalFit:
     """Fit a turn about an axis with a steady or a swinging nod to cameras.
 
     Parameters
     ----------
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
+    axis : AxisFit
+        The turn that fits them without a nod.
     """
     time = np.linspace(-1.0, 1.0, len(rotations), dtype=np.float64)
     functions: tuple[tuple[Callable[[NDArray[np.float64]], NDArray[np.float64]], int], ...] = (
@@ -57,25 +58,21 @@ def fit_gimbal(rotations: NDArray[np.float64]) -> GimbalFit:
         (lambda angles: fit_swing(time, angles, 0), 5),
         (lambda angles: fit_swing(time, angles, 1), 6),
     )
-    best, best_score = GimbalFit(np.zeros((len(rotations), 3)), fit_axis(rotations)), math.inf
-    for function, parameters in functions:
-        found = _fit(rotations, function)
-        found_score = score(float((found.axis.tilt**2).sum(axis=1).mean()), parameters)
-        if found_score < best_score:
-            best, best_score = found, found_score
+    found = [(_fit(rotations, axis, function), number) for function, number in functions]
+    best, _ = min(
+        found, key=lambda fit: score(float((fit[0].axis.tilt ** 2).sum(axis=1).mean()), fit[1])
+    )
     return best
 
 
 def _fit(
     rotations: NDArray[np.float64],
+    axis: AxisFit,
     function: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> GimbalFit:
     """Fit the axis of the world with the nod known, and the nod with the turn known, in turns."""
-    nod = np.zeros((len(rotations), 3))
-    axis = fit_axis(rotations)
     for _ in range(_ROUNDS):
-        turned = axis.rotations
-        tilt = so3.log(rotations @ turned.transpose(0, 2, 1))
+        tilt = so3.log(rotations @ axis.rotations.transpose(0, 2, 1))
         smooth = smooth_tilt(tilt)
         weights = 1.0 / np.maximum(1.0, np.linalg.norm(smooth, axis=1) / _OUTLIER)
         about = np.linalg.eigh((smooth * weights[:, None]).T @ smooth)[1][:, 2]

@@ -185,7 +185,6 @@ def with_simple_path(
                 free, rotations=trial.rotations, simpler=free.rotations, simpler_share=1.0
             )
             reasons.append(f"turned to where points rest, by {trust:.0%} of the way")
-    limit = max(SPAN_LIMIT, part_outside_span(measurements, free.rotations))
     paths = trial.paths()
     if not paths:
         reasons.append("the cameras keep to no axis")
@@ -198,6 +197,7 @@ def with_simple_path(
         turn = path.turn if path.is_loose else _refined(path, verdict, trial, hook)
         outside = part_outside_span(measurements, turn.rotations)
         criteria[f"{path.name}_outside_span"] = outside
+        limit = max(SPAN_LIMIT, part_outside_span(measurements, free.rotations))
         if outside > limit and not denoised:
             reasons.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
             continue

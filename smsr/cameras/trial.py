@@ -200,7 +200,7 @@ class Trial:
         axis, nod = fit_axis(self.rotations), None
         steady = self.rotations
         if not axis.is_followed():
-            gimbal = fit_gimbal(self.rotations)
+            gimbal = fit_gimbal(self.rotations, axis)
             axis, nod = gimbal.axis, gimbal.nod
             steady = so3.exp(-nod) @ self.rotations
             if not axis.is_followed():
