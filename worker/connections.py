@@ -52,3 +52,9 @@ def connect_async(url: str) -> redis.asyncio.Redis:
         socket_connect_timeout=CONNECT_TIMEOUT,
         health_check_interval=HEALTH_CHECK_INTERVAL,
     )
+
+
+def server_time(client: redis.Redis) -> float:
+    """Return Unix seconds by the clock of Redis, which all processes share."""
+    seconds, microseconds = client.time()
+    return float(seconds + microseconds / 1e6)

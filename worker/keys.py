@@ -16,6 +16,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
+from worker.connections import server_time
 from worker.records import PREFIX
 
 if TYPE_CHECKING:
@@ -110,11 +111,10 @@ class KeyStore:
                 "underscores, with a letter or a digit first"
             )
         key_id, secret = secrets.token_hex(6), secrets.token_hex(32)
-        seconds, microseconds = self._redis.time()
         key = ApiKey(
             id=key_id,
             owner=owner,
-            created_at=seconds + microseconds / 1e6,
+            created_at=server_time(self._redis),
             note=note,
             requests_per_minute=requests_per_minute,
             jobs=jobs,

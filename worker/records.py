@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast, get_args
 
 from smsr.progress import Progress
 from worker import counters
+from worker.connections import server_time
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -504,12 +505,16 @@ class RecordStore:
 
     def expired(self, limit: int = 100) -> Sequence[str]:
         """Return ids of jobs whose time to live has passed."""
-        due = self.redis.zrangebyscore(f"{PREFIX}:expiry", "-inf", self._now(), start=0, num=limit)
+        due = self.redis.zrangebyscore(
+            f"{PREFIX}:expiry", "-inf", server_time(self.redis), start=0, num=limit
+        )
         return [job_id.decode() for job_id in cast("list[bytes]", due)]
 
     def garbage(self, limit: int = 100) -> Sequence[str]:
         """Return storage prefixes that are to be removed now."""
-        due = self.redis.zrangebyscore(f"{PREFIX}:garbage", "-inf", self._now(), start=0, num=limit)
+        due = self.redis.zrangebyscore(
+            f"{PREFIX}:garbage", "-inf", server_time(self.redis), start=0, num=limit
+        )
         return [prefix.decode() for prefix in cast("list[bytes]", due)]
 
     def count_removed(self, kind: str, count: int) -> None:
@@ -526,11 +531,11 @@ class RecordStore:
 
     def put_off_garbage(self, prefix: str, seconds: float) -> None:
         """Have a storage prefix that could not be emptied looked at again after some seconds."""
-        self.redis.zadd(f"{PREFIX}:garbage", {prefix: self._now() + seconds}, xx=True)
+        self.redis.zadd(f"{PREFIX}:garbage", {prefix: server_time(self.redis) + seconds}, xx=True)
 
     def sign_of_life(self, worker: str, forget_seconds: float = 3600) -> None:
         """Note that a worker process lives."""
-        now = self._now()
+        now = server_time(self.redis)
         with self.redis.pipeline() as pipe:
             pipe.zadd(_WORKERS, {worker: now})
             pipe.zremrangebyscore(_WORKERS, "-inf", now - forget_seconds)
@@ -542,11 +547,7 @@ class RecordStore:
 
     def workers_since(self, seconds: float) -> int:
         """Return the number of worker processes that gave a sign of life since then."""
-        return self.redis.zcount(_WORKERS, self._now() - seconds, "+inf")
-
-    def _now(self) -> float:
-        seconds, microseconds = self.redis.time()
-        return seconds + microseconds / 1e6
+        return self.redis.zcount(_WORKERS, server_time(self.redis) - seconds, "+inf")
 
     # What owners take
 

@@ -24,6 +24,7 @@ from importlib import resources
 from threading import Lock
 from typing import TYPE_CHECKING, Any, cast
 
+from worker.connections import server_time
 from worker.records import PREFIX, InputFile, upload_key
 from worker.storage import ObjectMissing, StorageError
 
@@ -321,14 +322,10 @@ class UploadStore:
         """Undo `take`: the job will not be."""
         self._step("give_back", owner, "*", job_id, *upload_ids)
 
-    def _now(self) -> float:
-        seconds, microseconds = self.redis.time()
-        return seconds + microseconds / 1e6
-
     def abandoned(self, limit: int = 100) -> Sequence[str]:
         """Return folders whose time is over."""
         due = self.redis.zrangebyscore(
-            f"{PREFIX}:incoming", "-inf", self._now(), start=0, num=limit
+            f"{PREFIX}:incoming", "-inf", server_time(self.redis), start=0, num=limit
         )
         return [folder.decode() for folder in cast("list[bytes]", due)]
 
@@ -338,7 +335,7 @@ class UploadStore:
 
     def put_off_folder(self, folder: str, seconds: float) -> None:
         """Have a folder that could not be emptied looked at again after some seconds."""
-        self.redis.zadd(f"{PREFIX}:incoming", {folder: self._now() + seconds}, xx=True)
+        self.redis.zadd(f"{PREFIX}:incoming", {folder: server_time(self.redis) + seconds}, xx=True)
 
     def forget_folder(self, folder: str) -> None:
         """Note that nothing is left in a folder."""

@@ -43,6 +43,14 @@ _PROBLEMS = _CONDITIONAL | example_responses(
     "storage-unavailable",
 )
 
+ImageVertical = Annotated[
+    ImageV,
+    Query(
+        description="Where the second image coordinate grows to: `down` for pixels; `auto` is "
+        "`down` where the first frame has no negative coordinates."
+    ),
+]
+
 
 def _binary(media_type: str, description: str) -> dict[str, Any]:
     content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
@@ -147,13 +155,7 @@ async def get_glb(
         float, Query(gt=0, le=1000, description="Frames of the sequence per second.")
     ] = GlbOptions().fps,
     every: Annotated[int, Query(ge=1, le=1_000_000, description="Take every n-th frame.")] = 1,
-    image_v: Annotated[
-        ImageV,
-        Query(
-            description="Where the second image coordinate grows to: `down` for pixels; `auto` is "
-            "`down` where the first frame has no negative coordinates."
-        ),
-    ] = "auto",
+    image_v: ImageVertical = "auto",
 ) -> Download:
     """Return the surface, as a mesh where faces were sent and as points otherwise, and its motion.
 
@@ -291,13 +293,7 @@ async def get_figure(
     job_id: JobId,
     name: FigureName,
     form: FigureFormat,
-    image_v: Annotated[
-        ImageV,
-        Query(
-            description="Where the second image coordinate grows to: `down` for pixels; `auto` is "
-            "`down` where the first frame has no negative coordinates."
-        ),
-    ] = "auto",
+    image_v: ImageVertical = "auto",
 ) -> Download:
     """Return a picture of the residuals, the singular values, the error, the shapes or the cameras.
 
