@@ -120,8 +120,9 @@ class Options:
         "auto",
         "How shapes are found: 'nuclear' minimises the nuclear norm to convergence, 'reweighted' "
         "a reweighted nuclear norm and the motion between frames, 'paper' follows the published "
-        "schedule of penalties. 'auto' is 'paper' in that preset; otherwise 'reweighted', with "
-        "depth faded out where the tracks do not bear it out, and one shape for a rigid object.",
+        "schedule of penalties. 'auto' is 'paper' in that preset; otherwise 'reweighted', refined "
+        "to the likeliest depths of a Gaussian deformation, with depth faded out where the tracks "
+        "do not bear it out, and one shape for a rigid object.",
     )
     shape_iterations: int = option(
         1000, "Most iterations of the shape stage.", minimum=1, maximum=100_000

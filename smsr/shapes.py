@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from smsr.deformation import likely_shapes
 from smsr.progress import ignore, part_of
 from smsr.proximal import singular_value_threshold, singular_values
 
@@ -44,6 +45,8 @@ class ShapeEstimate:
         Stopping residual at each iteration.
     complexity : float
         See `DepthProblem.complexity`; 0 where it was not measured.
+    flicker : float
+        See `flicker`; 0 where it was not measured.
     """
 
     shapes: NDArray[np.float64]
@@ -52,6 +55,7 @@ class ShapeEstimate:
     reason: str
     residuals: tuple[float, ...] = ()
     complexity: float = 0.0
+    flicker: float = 0.0
 
 
 def planar_shapes(
@@ -328,17 +332,31 @@ def estimate_shapes(
         return rigid_shapes(measurements, rotations)
     limits["motion_weight"] = options.motion_weight
     limits["coherent"] = coherent
-    found = reweighted_shapes(measurements, rotations, **limits)
     if options.shape_method == "reweighted":
-        return found
-    if simpler is not None and share > 0.0:
-        other = reweighted_shapes(measurements, simpler, **limits)
+        return reweighted_shapes(measurements, rotations, **limits)
+
+    def solve(
+        cameras: NDArray[np.float64], weight: float = 1.0, *, deep: bool = False
+    ) -> ShapeEstimate:
+        found = reweighted_shapes(measurements, cameras, deep=deep, **limits)
+        if weight < _LITTLE:
+            return found
+        return with_likely_depth(
+            found, cameras, noise, max_iterations=options.shape_iterations, hook=hook
+        )
+
+    if simpler is None or share == 0.0:
+        found = solve(rotations)
+    else:
+        found, other = solve(rotations, 1.0 - share), solve(simpler, share)
         found = with_mean_depth(found, rotations, other, simpler, share)
     found = credible_depth(found, rotations)
     if found.complexity < DOUBTFUL or _trust(noise) == 0.0:
         return found
-    deep = reweighted_shapes(measurements, rotations, deep=True, **limits)
-    return with_deep_shapes(found, deep, rotations, noise)
+    return with_deep_shapes(found, solve(rotations, deep=True), rotations, noise)
+
+
+_LITTLE = 0.25  # part of the depths that is not worth the time to refine it
 
 
 def low_rank_shapes(
@@ -486,7 +504,9 @@ def reweighted_shapes(
         count = left if index == _ROUNDS - 1 else min(_ITERATIONS_PER_ROUND, left)
         part = part_of(hook, (index + 1) / (_ROUNDS + 1), (index + 2) / (_ROUNDS + 1))
         converged = problem.minimise(count, tolerance, part)
-    return dataclasses.replace(_estimate(problem, converged), complexity=complexity)
+    return dataclasses.replace(
+        _estimate(problem, converged), complexity=complexity, flicker=by_flicker
+    )
 
 
 _FIRST_ITERATIONS = 30
@@ -596,6 +616,76 @@ def rigid_shapes(
         iterations=0,
         converged=True,
         reason="one shape for all frames",
+    )
+
+
+LIKELY = (0.55, 0.75)
+"""Complexities between which the likely depths lose their part."""
+
+_LIKELY_NOISE = 0.1  # part of the tracks' spread
+_LIKELY_DIRECTIONS = 24
+_LIKELY_FLOOR = 0.004
+_FLOOR_BY_NOISE = 0.3
+_LIKELY_ROUNDS = 60
+_LIKELY_TOLERANCE = 2e-4
+
+
+def with_likely_depth(
+    estimate: ShapeEstimate,
+    rotations: NDArray[np.float64],
+    noise: float = 0.0,
+    *,
+    max_iterations: int = 1000,
+    hook: StageHook = ignore,
+) -> ShapeEstimate:
+    """Return the shapes with depths that are likelier under a Gaussian model of the deformation.
+
+    See `smsr.deformation`. The depths count less where depth is doubtful, where noise was taken off
+    (what is left of it looks like deformation), and where the motion flickered, of which the model
+    knows nothing.
+
+    Parameters
+    ----------
+    estimate : ShapeEstimate
+        With its complexity and flicker.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    noise : float
+        Standard deviation of the noise that was taken off, as a part of the tracks' spread.
+    max_iterations : int
+        Of all, those that the estimate took included.
+    hook : callable
+        See `smsr.progress.StageHook`.
+    """
+    rounds = min(_LIKELY_ROUNDS, max_iterations - estimate.iterations)
+    low, high = LIKELY
+    part = min(max((high - estimate.complexity) / (high - low), 0.0), 1.0)
+    part *= max(1.0 - noise / _LIKELY_NOISE, 0.0)
+    part *= 1.0 - estimate.flicker / _MOST_BY_HASTE
+    # Directions that carry little of the tracks have hardly any depth, and cost as much as others.
+    seen = (rotations[:, :2] @ estimate.shapes).reshape(2 * len(rotations), -1)
+    _, values, right = np.linalg.svd(seen, full_matrices=False)
+    count = min(_LIKELY_DIRECTIONS, int((values > 1e-9 * values[0]).sum()))
+    directions = right[:count].T
+    some = estimate.shapes @ directions
+    flat = some.reshape(len(some), -1)
+    deformation = float(np.linalg.norm(flat - flat.mean(axis=0)))
+    if rounds < 1 or part == 0.0 or deformation <= _RIGID * float(np.linalg.norm(flat)):
+        return estimate
+    likely = likely_shapes(
+        some,
+        rotations,
+        floor=_LIKELY_FLOOR + _FLOOR_BY_NOISE * noise,
+        max_iterations=rounds,
+        tolerance=_LIKELY_TOLERANCE,
+        hook=hook,
+    )
+    shapes = estimate.shapes + part * (likely.shapes - some) @ directions.T
+    return dataclasses.replace(
+        estimate,
+        shapes=shapes,
+        iterations=estimate.iterations + likely.iterations,
+        reason=f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them",
     )
 
 

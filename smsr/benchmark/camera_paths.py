@@ -24,9 +24,11 @@ from threadpoolctl import threadpool_limits
 
 from smsr.alignment import orthogonal_factor
 from smsr.files import open_array
+from smsr.noise import virtual_points
+from smsr.options import Options
 from smsr.pipeline import reconstruct
 from smsr.rotations import complete
-from smsr.shapes import reweighted_shapes
+from smsr.shapes import estimate_shapes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -271,6 +273,19 @@ def tracks(folder: Path, key: Key) -> tuple[Array, Array, Array]:
     return W + noise * np.abs(W).max() * rng.standard_normal(W.shape), rotations, true
 
 
+def with_true_cameras(W: Array, rotations: Array) -> Array:
+    """Return the shapes (T, 3, N) of the default shape stage under known cameras."""
+    centred = W - W.mean(axis=1, keepdims=True)
+    left, values, _ = np.linalg.svd(centred, full_matrices=False)
+    some = values > 1e-9 * values[0]
+    points = virtual_points(left[:, some], values[some], W.shape[1])
+    unit = points.values[0]
+    noise = points.noise / float(np.sqrt((centred**2).mean()))
+    found = estimate_shapes(points.left * (points.values / unit), rotations, Options(), noise=noise)
+    shapes: Array = found.shapes @ (unit * points.coordinates @ centred)
+    return shapes
+
+
 def measure_member(folder: Path, key: Key) -> Member:
     """Make one member and reconstruct it in the three ways."""
     W, rotations, true = tracks(folder, key)
@@ -278,8 +293,7 @@ def measure_member(folder: Path, key: Key) -> Member:
     start = time.process_time()
     result = reconstruct(W)
     seconds = time.process_time() - start
-    centred = W - W.mean(axis=1, keepdims=True)
-    known = reweighted_shapes(centred, rotations).shapes
+    known = with_true_cameras(W, rotations)
     return Member(
         *key,
         model=result.diagnostics.camera_model,

@@ -20,6 +20,7 @@ from smsr.shapes import (
     reweighted_shapes,
     rigid_shapes,
     with_deep_shapes,
+    with_likely_depth,
     with_mean_depth,
 )
 
@@ -259,6 +260,70 @@ class TestMotionScale:
     def test_two_frames_have_no_haste(self) -> None:
         W, rotations, _ = sequence(frames=2)
         assert flicker(DepthProblem(W, rotations)) == 0.0
+
+
+class TestLikelyDepth:
+    def moved(self, *, noise: float = 0.0, **changes: Any) -> float:
+        """Return by how much depths change of an estimate with changes."""
+        W, rotations, _ = sequence(modes=4)
+        found = dataclasses.replace(reweighted_shapes(W, rotations), **changes)
+        likely = with_likely_depth(found, rotations, noise)
+        seen = (rotations[:, :2] @ likely.shapes).reshape(W.shape)
+        np.testing.assert_allclose(seen, W, atol=1e-9)
+        return float(np.linalg.norm(likely.shapes - found.shapes))
+
+    def test_it_lowers_the_error(self) -> None:
+        W, rotations, shapes = sequence(modes=4)
+        found = reweighted_shapes(W, rotations)
+        likely = with_likely_depth(found, rotations)
+        assert relative_error(likely.shapes, shapes) < 0.9 * relative_error(found.shapes, shapes)
+        assert likely.iterations > found.iterations
+        assert "Gaussian" in likely.reason
+
+    def test_it_counts_less_where_depth_is_doubtful(self) -> None:
+        full = self.moved(complexity=0.5)
+        assert self.moved(complexity=0.65) == pytest.approx(0.5 * full)
+        assert self.moved(complexity=0.75) == 0.0
+
+    def test_it_counts_less_where_the_motion_flickered(self) -> None:
+        assert self.moved(flicker=1.0) == pytest.approx(0.5 * self.moved())
+        assert self.moved(flicker=2.0) == 0.0
+
+    def test_it_counts_less_where_there_was_noise(self) -> None:
+        assert self.moved(noise=0.1) == 0.0
+        assert 0.0 < self.moved(noise=0.09) < self.moved()
+
+    def test_weak_directions_keep_their_depth(self) -> None:
+        W, rotations, _ = sequence(points=40, modes=4)
+        rng = np.random.default_rng(0)
+        W = W + 1e-4 * rng.standard_normal(W.shape)
+        found = reweighted_shapes(W, rotations)
+        change = (with_likely_depth(found, rotations).shapes - found.shapes).reshape(-1, 40)
+        assert np.linalg.matrix_rank(change, tol=1e-9 * np.linalg.norm(change)) == 24
+        weak = np.linalg.svd(W)[2][24:]
+        assert np.abs(change @ weak.T).max() < 1e-12
+
+    def test_points_may_be_mixed(self) -> None:
+        W, rotations, _ = sequence(modes=4)
+        found = reweighted_shapes(W, rotations)
+        mixing = np.linalg.qr(np.random.default_rng(0).standard_normal((20, 20)))[0]
+        mixed = dataclasses.replace(found, shapes=found.shapes @ mixing)
+        plain, after = (with_likely_depth(each, rotations).shapes for each in (found, mixed))
+        np.testing.assert_allclose(after, plain @ mixing, atol=1e-9)
+
+    def test_it_takes_no_more_iterations_than_are_left(self) -> None:
+        W, rotations, _ = sequence(modes=4)
+        found = reweighted_shapes(W, rotations)
+        limits = (found.iterations, found.iterations + 3)
+        counts = [
+            with_likely_depth(found, rotations, max_iterations=limit).iterations for limit in limits
+        ]
+        assert tuple(counts) == limits
+
+    def test_a_rigid_object_is_left_alone(self) -> None:
+        W, rotations, _ = sequence(modes=0)
+        found = rigid_shapes(W, rotations)
+        assert with_likely_depth(found, rotations) is found
 
 
 class TestTwoSolutions:

@@ -1,0 +1,288 @@
+"""The most likely shapes under a Gaussian model of the deformation that is learnt with them.
+
+Shapes of few basis shapes are simple, but of all simple ones the penalties on singular values take
+the flattest. Here the shapes of all frames are one sample of a Gaussian process,
+
+    E[S_t] = m,    cov(S_s, S_t) = a^|s - t| Sigma                          (S_t as a 3q-vector),
+
+and the depths, conditioned on the tracks, are its posterior mean. Mean and covariance are those
+under which the tracks are likeliest, found by expectation and maximisation (Dempster, Laird, Rubin
+1977); the correlation is the expected one. Other than in a penalised fit, depths that are uncertain
+count in Sigma with their uncertainty, which keeps it from shrinking onto what was found first.
+L. Torresani, A. Hertzmann, C. Bregler (PAMI 2008) model basis weights so; here the whole shape is
+the state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from smsr.progress import ignore
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smsr.progress import StageHook
+
+_FIRST_CORRELATION = 0.9
+_MOST_CORRELATION = 0.9999
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deformation:
+    """A Gaussian autoregressive process of shapes.
+
+    Attributes
+    ----------
+    mean : ndarray of shape (3q,)
+        m.
+    covariance : ndarray of shape (3q, 3q)
+        Sigma, of full rank.
+    correlation : float
+        a, between consecutive frames, 0 <= a < 1.
+    """
+
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    correlation: float
+
+    def precision(self) -> NDArray[np.float64]:
+        """Return the inverse of the covariance."""
+        return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Depths given the tracks.
+
+    Attributes
+    ----------
+    depths : ndarray of shape (T, q)
+        Their mean.
+    covariances : ndarray of shape (T, q, q)
+        Of the depths of each frame.
+    next_covariances : ndarray of shape (T - 1, q, q)
+        Of the depths of each frame with those of the next.
+    """
+
+    depths: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    next_covariances: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LikelyShapes:
+    """Outcome of `likely_shapes`.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (T, 3, q)
+        S, with W = R S as before.
+    deformation : Deformation
+        The model that was learnt last.
+    iterations : int
+        Rounds of expectation and maximisation.
+    change : float
+        Of the shapes in the last round, relative to their norm.
+    """
+
+    shapes: NDArray[np.float64]
+    deformation: Deformation
+    iterations: int
+    change: float
+
+
+def likely_shapes(
+    shapes: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    *,
+    floor: float,
+    max_iterations: int,
+    tolerance: float,
+    hook: StageHook = ignore,
+) -> LikelyShapes:
+    """Move the depths of shapes to where the tracks are likelier.
+
+    Rounds are few on purpose: the likelihood of a model with so many parameters goes on rising
+    after the depths have become worse.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (T, 3, q)
+        S to start from, not rigid. What the cameras see of it stays.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    floor : float
+        Standard deviation of what no other coordinate tells, as a part of the root mean square of
+        the coordinates; more than 0.
+    max_iterations : int
+        Most rounds.
+    tolerance : float
+        Change of the shapes in a round, relative to their norm, at which to stop.
+    hook : callable
+        See `smsr.progress.StageHook`.
+    """
+    frames, _, points = shapes.shape
+    axis = np.ascontiguousarray(rotations[:, 2])
+    depths = np.matmul(axis[:, None], shapes)[:, 0]
+    planar = shapes - axis[:, :, None] * depths[:, None]
+    variance = floor**2 * float((shapes**2).mean())
+    nothing = np.zeros((frames, points, points))
+    deformation = _learn(
+        shapes, axis, Posterior(depths, nothing, nothing[1:]), _FIRST_CORRELATION, variance
+    )
+    change = 0.0
+    iteration = 0
+    for iteration in range(1, max_iterations + 1):
+        posterior = condition(deformation, planar, axis)
+        change = float(np.linalg.norm(posterior.depths - depths) / np.linalg.norm(shapes))
+        depths = posterior.depths
+        shapes = planar + axis[:, :, None] * depths[:, None]
+        correlation = _correlation(deformation, shapes, axis, posterior)
+        deformation = _learn(shapes, axis, posterior, correlation, variance)
+        hook(iteration / max_iterations, iteration, change)
+        if change < tolerance:
+            break
+    return LikelyShapes(shapes, deformation, iteration, change)
+
+
+def condition(
+    deformation: Deformation, planar: NDArray[np.float64], axis: NDArray[np.float64]
+) -> Posterior:
+    """Return the depths given all that the cameras see.
+
+    The precision of the depths of all frames is block-tridiagonal; it is factored from the first
+    frame to the last, and mean and covariances follow on the way back (Rauch, Tung, Striebel 1965).
+
+    Parameters
+    ----------
+    deformation : Deformation
+        The model.
+    planar : ndarray of shape (T, 3, q)
+        The shapes of zero depth, R^+ W.
+    axis : ndarray of shape (T, 3)
+        Viewing directions.
+    """
+    frames, _, points = planar.shape
+    here, ahead = _temporal_precision(frames, deformation.correlation)
+    precision = deformation.precision()
+    blocks = _by_axes(precision, points)
+    diagonal = (_outer(axis, axis) * here[:, None] @ blocks).reshape(frames, points, points)
+    coupling = (ahead * _outer(axis[:-1], axis[1:]) @ blocks).reshape(-1, points, points)
+    pull = (planar.reshape(frames, -1) - deformation.mean) @ precision
+    force = here[:, None] * pull
+    force[:-1] += ahead * pull[1:]
+    force[1:] += ahead * pull[:-1]
+    force = -np.matmul(axis[:, None], force.reshape(frames, 3, points))[:, 0]
+
+    inverses = np.empty_like(diagonal)
+    gains = np.empty_like(coupling)
+    depths = np.empty_like(force)
+    for t in range(frames):
+        block, right = diagonal[t], force[t]
+        if t > 0:
+            block = block - coupling[t - 1].T @ gains[t - 1]
+            right = right - coupling[t - 1].T @ depths[t - 1]
+        inverses[t] = np.linalg.inv(block)
+        depths[t] = inverses[t] @ right
+        if t < frames - 1:
+            gains[t] = inverses[t] @ coupling[t]
+    covariances = inverses
+    next_covariances = np.empty_like(coupling)
+    for t in range(frames - 2, -1, -1):
+        depths[t] -= gains[t] @ depths[t + 1]
+        next_covariances[t] = -gains[t] @ covariances[t + 1]
+        covariances[t] -= next_covariances[t] @ gains[t].T
+    return Posterior(depths, covariances, next_covariances)
+
+
+def _learn(
+    shapes: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    posterior: Posterior,
+    correlation: float,
+    variance: float,
+) -> Deformation:
+    """Return the model of the largest expected likelihood, with a least variance."""
+    frames = len(shapes)
+    here, ahead = _temporal_precision(frames, correlation)
+    flat = shapes.reshape(frames, -1)
+    mean = flat.mean(axis=0)
+    deviation = flat - mean
+    same = (deviation * here[:, None]).T @ deviation + _spread(
+        _outer(axis, axis) * here[:, None], posterior.covariances
+    )
+    following = deviation[:-1].T @ deviation[1:] + _spread(
+        _outer(axis[:-1], axis[1:]), posterior.next_covariances
+    )
+    covariance = (same + ahead * (following + following.T)) / frames
+    covariance = 0.5 * (covariance + covariance.T)
+    covariance[np.diag_indices_from(covariance)] += variance
+    return Deformation(mean, covariance, correlation)
+
+
+def _correlation(
+    deformation: Deformation,
+    shapes: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    posterior: Posterior,
+) -> float:
+    """Return the expected correlation of consecutive frames, all directions alike.
+
+    It is less than the likeliest: directions that hardly move are near the least variance, and
+    would have it near 1.
+    """
+    frames = len(shapes)
+    flat = shapes.reshape(frames, -1)
+    deviation = flat - flat.mean(axis=0)
+    precision = deformation.precision()
+    blocks = _by_axes(precision, shapes.shape[2])
+    white = deviation @ precision
+    same = float((white * deviation).sum()) + float(
+        ((_outer(axis, axis) @ blocks) * posterior.covariances.reshape(frames, -1)).sum()
+    )
+    following = float((white[:-1] * deviation[1:]).sum()) + float(
+        (
+            (_outer(axis[:-1], axis[1:]) @ blocks)
+            * posterior.next_covariances.reshape(frames - 1, -1)
+        ).sum()
+    )
+    return min(max(following / same, 0.0), _MOST_CORRELATION)
+
+
+def _temporal_precision(frames: int, correlation: float) -> tuple[NDArray[np.float64], float]:
+    """Return diagonal (T,) and off-diagonal of the inverse of ``a^|s - t|``."""
+    scale = 1.0 / (1.0 - correlation**2)
+    diagonal = np.full(frames, (1.0 + correlation**2) * scale)
+    diagonal[[0, -1]] = scale
+    return diagonal, -correlation * scale
+
+
+def _outer(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the products (T, 9) of the coordinates of directions (T, 3)."""
+    return (first[:, :, None] * second[:, None, :]).reshape(len(first), 9)
+
+
+def _by_axes(matrix: NDArray[np.float64], points: int) -> NDArray[np.float64]:
+    """Return a matrix (3q, 3q) as its nine blocks (9, q^2), one for each pair of axes."""
+    blocks = matrix.reshape(3, points, 3, points).transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(blocks).reshape(9, points * points)
+
+
+def _spread(weights: NDArray[np.float64], covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum over frames (3q, 3q) of covariances of depths (T, q, q) as those of shapes.
+
+    Parameters
+    ----------
+    weights : ndarray of shape (T, 9)
+        See `_outer`.
+    covariances : ndarray of shape (T, q, q)
+        Of depths.
+    """
+    frames, points, _ = covariances.shape
+    blocks = weights.T @ covariances.reshape(frames, -1)
+    spread = blocks.reshape(3, 3, points, points).transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(spread).reshape(3 * points, 3 * points)

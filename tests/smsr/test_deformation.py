@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from smsr import rotations as so3
+from smsr.deformation import Deformation, condition, likely_shapes
+from smsr.shapes import low_rank_shapes
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+
+def model(points: int, correlation: float, seed: int = 0, rank: int | None = None) -> Deformation:
+    """Return a process with a random mean and a covariance of full or of little rank."""
+    rng = np.random.default_rng(seed)
+    factor = rng.standard_normal((3 * points, rank or 3 * points))
+    covariance = factor @ factor.T / factor.shape[1] + 1e-6 * np.eye(3 * points)
+    return Deformation(rng.standard_normal(3 * points), covariance, correlation)
+
+
+def temporal_covariance(frames: int, correlation: float) -> Array:
+    times = np.arange(frames)
+    return np.asarray(correlation ** np.abs(times[:, None] - times), dtype=np.float64)
+
+
+def sample(deformation: Deformation, frames: int, seed: int = 1) -> Array:
+    """Draw shapes (T, 3, q)."""
+    rng = np.random.default_rng(seed)
+    in_time = np.linalg.cholesky(temporal_covariance(frames, deformation.correlation))
+    in_space = np.linalg.cholesky(deformation.covariance)
+    white = rng.standard_normal((frames, len(deformation.mean)))
+    return (in_time @ white @ in_space.T + deformation.mean).reshape(frames, 3, -1)
+
+
+def turning(frames: int, degrees: float) -> Array:
+    angles = np.radians(degrees) * np.arange(frames)[:, None]
+    return so3.exp(angles * np.array([0.1, 1.0, 0.2]))
+
+
+def without_depth(shapes: Array, rotations: Array) -> Array:
+    axis = rotations[:, 2]
+    flat: Array = shapes - axis[:, :, None] * np.matmul(axis[:, None], shapes)
+    return flat
+
+
+def log_likelihood(deformation: Deformation, shapes: Array, rotations: Array) -> float:
+    """Return that of what the cameras see of the shapes, from the covariance of all of it."""
+    frames = len(shapes)
+    in_time = temporal_covariance(frames, deformation.correlation)
+    seen, blocks = [], []
+    for rotation, shape in zip(rotations, shapes, strict=True):
+        camera = np.kron(rotation[:2], np.eye(shape.shape[1]))
+        blocks.append(camera)
+        seen.append(camera @ (shape.ravel() - deformation.mean))
+    covariance = np.block(
+        [
+            [
+                in_time[s, t] * blocks[s] @ deformation.covariance @ blocks[t].T
+                for t in range(frames)
+            ]
+            for s in range(frames)
+        ]
+    )
+    y = np.concatenate(seen)
+    _, determinant = np.linalg.slogdet(covariance)
+    return float(-0.5 * (determinant + y @ np.linalg.solve(covariance, y)))
+
+
+class TestCondition:
+    @pytest.mark.parametrize("correlation", [0.0, 0.6, 0.98])
+    def test_it_is_the_conditional_of_the_joint_gaussian(self, correlation: float) -> None:
+        frames, points = 5, 3
+        deformation = model(points, correlation)
+        shapes, rotations = sample(deformation, frames), turning(frames, 20.0)
+        joint = np.kron(temporal_covariance(frames, correlation), deformation.covariance)
+        see, look = (np.zeros((frames * k * points, frames * 3 * points)) for k in (2, 1))
+        for t, rotation in enumerate(rotations):
+            columns = slice(t * 3 * points, (t + 1) * 3 * points)
+            eye = np.eye(points)
+            see[t * 2 * points : (t + 1) * 2 * points, columns] = np.kron(rotation[:2], eye)
+            look[t * points : (t + 1) * points, columns] = np.kron(rotation[2:], eye)
+        mean = np.tile(deformation.mean, frames)
+        gain = look @ joint @ see.T @ np.linalg.inv(see @ joint @ see.T)
+        depths = look @ mean + gain @ see @ (shapes.ravel() - mean)
+        covariance = look @ joint @ look.T - gain @ see @ joint @ look.T
+
+        found = condition(deformation, without_depth(shapes, rotations), rotations[:, 2])
+        np.testing.assert_allclose(found.depths.ravel(), depths, atol=1e-8)
+        blocks = covariance.reshape(frames, points, frames, points)
+        for t in range(frames):
+            np.testing.assert_allclose(found.covariances[t], blocks[t, :, t], atol=1e-8)
+        for t in range(frames - 1):
+            np.testing.assert_allclose(found.next_covariances[t], blocks[t, :, t + 1], atol=1e-8)
+
+    def test_one_frame_has_no_next(self) -> None:
+        deformation, rotations = model(3, 0.5), turning(1, 0.0)
+        shapes = sample(deformation, 1)
+        found = condition(deformation, without_depth(shapes, rotations), rotations[:, 2])
+        assert found.depths.shape == (1, 3)
+        assert found.next_covariances.shape == (0, 3, 3)
+
+
+class TestLikelyShapes:
+    def test_a_sample_of_the_process_is_found_better_than_by_the_nuclear_norm(self) -> None:
+        true = sample(model(12, 0.95, rank=4), 150)
+        rotations = turning(150, 4.0)
+        W = (rotations[:, :2] @ true).reshape(300, 12)
+        start = low_rank_shapes(W, rotations).shapes
+        found = likely_shapes(start, rotations, floor=0.004, max_iterations=60, tolerance=0.0)
+        before, after = (float(np.linalg.norm(S - true)) for S in (start, found.shapes))
+        assert after < 0.5 * before
+        assert found.deformation.correlation == pytest.approx(0.95, abs=0.1)
+
+    def test_the_tracks_become_likelier_and_stay_as_they_are(self) -> None:
+        true = sample(model(5, 0.8, rank=3), 60)
+        rotations = turning(60, 10.0)
+        W = (rotations[:, :2] @ true).reshape(120, 5)
+        start = low_rank_shapes(W, rotations).shapes
+        values = []
+        for rounds in (1, 3, 10, 30):
+            found = likely_shapes(
+                start, rotations, floor=0.001, max_iterations=rounds, tolerance=0.0
+            )
+            assert found.iterations == rounds
+            np.testing.assert_allclose(
+                (rotations[:, :2] @ found.shapes).reshape(W.shape), W, atol=1e-9
+            )
+            values.append(log_likelihood(found.deformation, found.shapes, rotations))
+        assert values == sorted(values)
+        assert values[-1] > values[0] + 100.0
+
+    @pytest.mark.parametrize("scale", [1e-4, 1e3])
+    def test_units_do_not_matter(self, scale: float) -> None:
+        true, rotations = sample(model(6, 0.9, rank=3), 30), turning(30, 6.0)
+        start = without_depth(true, rotations) + 0.5 * (true - without_depth(true, rotations))
+        plain, scaled = (
+            likely_shapes(k * start, rotations, floor=0.01, max_iterations=5, tolerance=0.0)
+            for k in (1.0, scale)
+        )
+        np.testing.assert_allclose(scaled.shapes, scale * plain.shapes, atol=1e-7 * scale)
+        assert scaled.change == pytest.approx(plain.change, rel=1e-6)
+
+    def test_it_stops_where_little_changes_and_reports(self) -> None:
+        true, rotations = sample(model(6, 0.9, rank=3), 30), turning(30, 6.0)
+        seen: list[tuple[float, int]] = []
+        found = likely_shapes(
+            true,
+            rotations,
+            floor=0.01,
+            max_iterations=50,
+            tolerance=0.5,
+            hook=lambda fraction, iteration, _: seen.append((fraction, iteration)),
+        )
+        assert found.iterations == 1
+        assert found.change < 0.5
+        assert seen == [(1 / 50, 1)]
