@@ -5,12 +5,11 @@ the flattest. Here the shapes of all frames are one sample of a Gaussian process
 
     E[S_t] = m,    cov(S_s, S_t) = a^|s - t| Sigma                          (S_t as a 3q-vector),
 
-and the depths, conditioned on the tracks, are its posterior mean. Mean and covariance are those
-under which the tracks are likeliest, found by expectation and maximisation (Dempster, Laird, Rubin
-1977); the correlation is the expected one. Other than in a penalised fit, depths that are uncertain
-count in Sigma with their uncertainty, which keeps it from shrinking onto what was found first.
-L. Torresani, A. Hertzmann, C. Bregler (PAMI 2008) model basis weights so; here the whole shape is
-the state.
+and the depths, conditioned on the tracks, are its posterior mean. Mean and covariance are learnt
+from the same tracks by expectation and maximisation (Dempster, Laird, Rubin 1977), the correlation
+by its moment (Yule, Walker). Unlike in a penalised fit, depths that are uncertain count in Sigma
+with their uncertainty, which keeps it from shrinking onto what was found first. L. Torresani,
+A. Hertzmann, C. Bregler (PAMI 2008) model basis weights so; here the whole shape is the state.
 """
 
 from __future__ import annotations
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
 
 _FIRST_CORRELATION = 0.9
 _MOST_CORRELATION = 0.9999
+_FEWEST_ROUNDS = 9
+_FARTHEST = 8.0  # steps that an extrapolation goes at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,11 +83,11 @@ class LikelyShapes:
     shapes : ndarray of shape (T, 3, q)
         S, with W = R S as before.
     deformation : Deformation
-        The model that was learnt last.
+        The model that they were found by.
     iterations : int
         Rounds of expectation and maximisation.
     change : float
-        Of the shapes in the last round, relative to their norm.
+        Of the depths in the last round, as a part of the deformation.
     """
 
     shapes: NDArray[np.float64]
@@ -106,22 +107,22 @@ def likely_shapes(
 ) -> LikelyShapes:
     """Move the depths of shapes to where the tracks are likelier.
 
-    Rounds are few on purpose: the likelihood of a model with so many parameters goes on rising
-    after the depths have become worse.
+    Every third round is extrapolated. Rounds are few on purpose: the likelihood of a model with so
+    many parameters goes on rising after the depths have become worse.
 
     Parameters
     ----------
     shapes : ndarray of shape (T, 3, q)
-        S to start from, not rigid. What the cameras see of it stays.
+        S to start from, not rigid, T >= 2. What the cameras see of it stays.
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     floor : float
-        Standard deviation of what no other coordinate tells, as a part of the root mean square of
-        the coordinates; more than 0.
+        Standard deviation in every direction at least, as a part of the root mean square over
+        frames and axes of the norm of a shape; more than 0.
     max_iterations : int
-        Most rounds.
+        Most rounds, at least 1.
     tolerance : float
-        Change of the shapes in a round, relative to their norm, at which to stop.
+        Change of the depths in a round, as a part of the deformation, at which to stop.
     hook : callable
         See `smsr.progress.StageHook`.
     """
@@ -129,24 +130,50 @@ def likely_shapes(
     axis = np.ascontiguousarray(rotations[:, 2])
     depths = np.matmul(axis[:, None], shapes)[:, 0]
     planar = shapes - axis[:, :, None] * depths[:, None]
-    variance = floor**2 * float((shapes**2).mean())
-    nothing = np.zeros((frames, points, points))
-    deformation = _learn(
-        shapes, axis, Posterior(depths, nothing, nothing[1:]), _FIRST_CORRELATION, variance
-    )
+    flat = shapes.reshape(frames, -1)
+    size = float(np.linalg.norm(flat - flat.mean(axis=0)))
+    variance = floor**2 * float((shapes**2).sum()) / (3 * frames)
+    certain = np.zeros((frames, points, points))
+    posterior = Posterior(depths, certain, certain[1:])
+    deformation = Deformation(flat.mean(axis=0), np.eye(3 * points), _FIRST_CORRELATION)
+    deformation = _learn(deformation, shapes, axis, posterior, variance, keep_correlation=True)
     change = 0.0
     iteration = 0
+    latest = [depths]
     for iteration in range(1, max_iterations + 1):
         posterior = condition(deformation, planar, axis)
-        change = float(np.linalg.norm(posterior.depths - depths) / np.linalg.norm(shapes))
-        depths = posterior.depths
-        shapes = planar + axis[:, :, None] * depths[:, None]
-        correlation = _correlation(deformation, shapes, axis, posterior)
-        deformation = _learn(shapes, axis, posterior, correlation, variance)
+        change = float(np.linalg.norm(posterior.depths - latest[-1])) / size
+        latest.append(posterior.depths)
         hook(iteration / max_iterations, iteration, change)
-        if change < tolerance:
+        # The first steps are as small as the least variance is, whatever is still to come.
+        if iteration == max_iterations or (iteration >= _FEWEST_ROUNDS and change < tolerance):
             break
+        if len(latest) == 3:
+            latest = [extrapolated(*latest)]
+        shapes = planar + axis[:, :, None] * latest[-1][:, None]
+        deformation = _learn(deformation, shapes, axis, posterior, variance)
+    shapes = planar + axis[:, :, None] * latest[-1][:, None]
     return LikelyShapes(shapes, deformation, iteration, change)
+
+
+def extrapolated(
+    first: NDArray[np.float64], second: NDArray[np.float64], third: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return where three successive values of a slow iteration lead.
+
+    Squared extrapolation (Varadhan, Roland, Scandinavian Journal of Statistics 2008, scheme S3), by
+    a bounded number of steps at once.
+
+    Parameters
+    ----------
+    first, second, third : ndarray
+        Values, the latest one last.
+    """
+    step = second - first
+    bend = third - second - step
+    length = float(np.linalg.norm(step)) / max(float(np.linalg.norm(bend)), np.finfo(float).tiny)
+    length = min(max(length, 1.0), _FARTHEST)
+    return first + 2.0 * length * step + length**2 * bend
 
 
 def condition(
@@ -162,7 +189,7 @@ def condition(
     deformation : Deformation
         The model.
     planar : ndarray of shape (T, 3, q)
-        The shapes of zero depth, R^+ W.
+        The shapes of zero depth, R^+ W, T >= 2.
     axis : ndarray of shape (T, 3)
         Viewing directions.
     """
@@ -200,61 +227,48 @@ def condition(
 
 
 def _learn(
+    deformation: Deformation,
     shapes: NDArray[np.float64],
     axis: NDArray[np.float64],
     posterior: Posterior,
-    correlation: float,
     variance: float,
+    *,
+    keep_correlation: bool = False,
 ) -> Deformation:
-    """Return the model of the largest expected likelihood, with a least variance."""
+    """Return the model of the largest expected likelihood, with a least variance.
+
+    The correlation is not the likeliest, but that of all directions of the former model alike:
+    directions that hardly move are near the least variance, and would have it near 1.
+    """
     frames = len(shapes)
-    here, ahead = _temporal_precision(frames, correlation)
     flat = shapes.reshape(frames, -1)
-    mean = flat.mean(axis=0)
+    weights = np.full(frames, 1.0 - deformation.correlation)
+    weights[[0, -1]] = 1.0
+    mean = weights @ flat / weights.sum()
     deviation = flat - mean
-    same = (deviation * here[:, None]).T @ deviation + _spread(
-        _outer(axis, axis) * here[:, None], posterior.covariances
+    ends = deviation[[0, -1]]
+    same = deviation.T @ deviation + _spread(axis, axis, posterior.covariances)
+    at_ends = ends.T @ ends + _spread(axis[[0, -1]], axis[[0, -1]], posterior.covariances[[0, -1]])
+    following = deviation[:-1].T @ deviation[1:]
+    following += _spread(axis[:-1], axis[1:], posterior.next_covariances)
+    correlation = deformation.correlation
+    if not keep_correlation:
+        precision = deformation.precision()
+        ratio = float((precision * following).sum() / (precision * same).sum())
+        correlation = min(max(ratio, 0.0), _MOST_CORRELATION)
+    scale = 1.0 / (1.0 - correlation**2)
+    covariance = (
+        scale
+        / frames
+        * (same + correlation**2 * (same - at_ends) - correlation * (following + following.T))
     )
-    following = deviation[:-1].T @ deviation[1:] + _spread(
-        _outer(axis[:-1], axis[1:]), posterior.next_covariances
-    )
-    covariance = (same + ahead * (following + following.T)) / frames
     covariance = 0.5 * (covariance + covariance.T)
     covariance[np.diag_indices_from(covariance)] += variance
     return Deformation(mean, covariance, correlation)
 
 
-def _correlation(
-    deformation: Deformation,
-    shapes: NDArray[np.float64],
-    axis: NDArray[np.float64],
-    posterior: Posterior,
-) -> float:
-    """Return the expected correlation of consecutive frames, all directions alike.
-
-    It is less than the likeliest: directions that hardly move are near the least variance, and
-    would have it near 1.
-    """
-    frames = len(shapes)
-    flat = shapes.reshape(frames, -1)
-    deviation = flat - flat.mean(axis=0)
-    precision = deformation.precision()
-    blocks = _by_axes(precision, shapes.shape[2])
-    white = deviation @ precision
-    same = float((white * deviation).sum()) + float(
-        ((_outer(axis, axis) @ blocks) * posterior.covariances.reshape(frames, -1)).sum()
-    )
-    following = float((white[:-1] * deviation[1:]).sum()) + float(
-        (
-            (_outer(axis[:-1], axis[1:]) @ blocks)
-            * posterior.next_covariances.reshape(frames - 1, -1)
-        ).sum()
-    )
-    return min(max(following / same, 0.0), _MOST_CORRELATION)
-
-
 def _temporal_precision(frames: int, correlation: float) -> tuple[NDArray[np.float64], float]:
-    """Return diagonal (T,) and off-diagonal of the inverse of ``a^|s - t|``."""
+    """Return diagonal (T,) and off-diagonal of the inverse of ``a^|s - t|``, T >= 2."""
     scale = 1.0 / (1.0 - correlation**2)
     diagonal = np.full(frames, (1.0 + correlation**2) * scale)
     diagonal[[0, -1]] = scale
@@ -272,17 +286,11 @@ def _by_axes(matrix: NDArray[np.float64], points: int) -> NDArray[np.float64]:
     return np.ascontiguousarray(blocks).reshape(9, points * points)
 
 
-def _spread(weights: NDArray[np.float64], covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sum over frames (3q, 3q) of covariances of depths (T, q, q) as those of shapes.
-
-    Parameters
-    ----------
-    weights : ndarray of shape (T, 9)
-        See `_outer`.
-    covariances : ndarray of shape (T, q, q)
-        Of depths.
-    """
+def _spread(
+    first: NDArray[np.float64], second: NDArray[np.float64], covariances: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the sum (3q, 3q) of covariances (T, q, q) of depths along two directions (T, 3)."""
     frames, points, _ = covariances.shape
-    blocks = weights.T @ covariances.reshape(frames, -1)
+    blocks = _outer(first, second).T @ covariances.reshape(frames, points * points)
     spread = blocks.reshape(3, 3, points, points).transpose(0, 2, 1, 3)
     return np.ascontiguousarray(spread).reshape(3 * points, 3 * points)

@@ -38,7 +38,7 @@ class ShapeEstimate:
     iterations : int
         Of the solver, all rounds together.
     converged : bool
-        Whether the last round met its tolerance.
+        Whether the last round met its tolerance; refinement to likely depths is not asked.
     reason : str
         Why it stopped, for a person.
     residuals : tuple of float
@@ -338,11 +338,12 @@ def estimate_shapes(
     def solve(
         cameras: NDArray[np.float64], weight: float = 1.0, *, deep: bool = False
     ) -> ShapeEstimate:
-        found = reweighted_shapes(measurements, cameras, deep=deep, **limits)
         if weight < _LITTLE:
-            return found
+            return reweighted_shapes(measurements, cameras, deep=deep, **limits)
+        first, second = part_of(hook, 0.0, 0.6), part_of(hook, 0.6, 1.0)
+        found = reweighted_shapes(measurements, cameras, deep=deep, **limits | {"hook": first})
         return with_likely_depth(
-            found, cameras, noise, max_iterations=options.shape_iterations, hook=hook
+            found, cameras, noise, max_iterations=options.shape_iterations, hook=second
         )
 
     if simpler is None or share == 0.0:
@@ -354,9 +355,6 @@ def estimate_shapes(
     if found.complexity < DOUBTFUL or _trust(noise) == 0.0:
         return found
     return with_deep_shapes(found, solve(rotations, deep=True), rotations, noise)
-
-
-_LITTLE = 0.25  # part of the depths that is not worth the time to refine it
 
 
 def low_rank_shapes(
@@ -622,12 +620,15 @@ def rigid_shapes(
 LIKELY = (0.55, 0.75)
 """Complexities between which the likely depths lose their part."""
 
+_LITTLE = 0.25  # part of depths that is not worth the time: refining it changes them by a percent
 _LIKELY_NOISE = 0.1  # part of the tracks' spread
 _LIKELY_DIRECTIONS = 24
-_LIKELY_FLOOR = 0.004
-_FLOOR_BY_NOISE = 0.3
-_LIKELY_ROUNDS = 60
-_LIKELY_TOLERANCE = 2e-4
+_LIKELY_FLOOR = 0.0008
+_FLOOR_BY_NOISE = 0.07
+_LIKELY_TOLERANCE = 5e-4
+_LEAST_ROUNDS = 10
+_MOST_ROUNDS = 40
+_FRAMES_IN_ALL_ROUNDS = 40_000
 
 
 def with_likely_depth(
@@ -647,7 +648,7 @@ def with_likely_depth(
     Parameters
     ----------
     estimate : ShapeEstimate
-        With its complexity and flicker.
+        With its complexity and flicker, T >= 2.
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     noise : float
@@ -657,11 +658,15 @@ def with_likely_depth(
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    rounds = min(_LIKELY_ROUNDS, max_iterations - estimate.iterations)
     low, high = LIKELY
     part = min(max((high - estimate.complexity) / (high - low), 0.0), 1.0)
     part *= max(1.0 - noise / _LIKELY_NOISE, 0.0)
     part *= 1.0 - estimate.flicker / _MOST_BY_HASTE
+    # The more frames there are, the surer is each round, and the longer it takes.
+    rounds = max(_LEAST_ROUNDS, min(_MOST_ROUNDS, _FRAMES_IN_ALL_ROUNDS // len(rotations)))
+    rounds = min(rounds, max_iterations - estimate.iterations)
+    if part == 0.0 or rounds < 1:
+        return estimate
     # Directions that carry little of the tracks have hardly any depth, and cost as much as others.
     seen = (rotations[:, :2] @ estimate.shapes).reshape(2 * len(rotations), -1)
     _, values, right = np.linalg.svd(seen, full_matrices=False)
@@ -669,8 +674,7 @@ def with_likely_depth(
     directions = right[:count].T
     some = estimate.shapes @ directions
     flat = some.reshape(len(some), -1)
-    deformation = float(np.linalg.norm(flat - flat.mean(axis=0)))
-    if rounds < 1 or part == 0.0 or deformation <= _RIGID * float(np.linalg.norm(flat)):
+    if np.linalg.norm(flat - flat.mean(axis=0)) <= _RIGID * np.linalg.norm(flat):
         return estimate
     likely = likely_shapes(
         some,

@@ -274,11 +274,21 @@ def tracks(folder: Path, key: Key) -> tuple[Array, Array, Array]:
 
 
 def with_true_cameras(W: Array, rotations: Array) -> Array:
-    """Return the shapes (T, 3, N) of the default shape stage under known cameras."""
+    """Return the shapes (T, 3, N) of the default shape stage under known cameras.
+
+    As for free cameras: that a path was recognised, which would lower the error, is not told.
+
+    Parameters
+    ----------
+    W : ndarray of shape (2T, N)
+        Rows u1, v1, u2, ...
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    """
     centred = W - W.mean(axis=1, keepdims=True)
     left, values, _ = np.linalg.svd(centred, full_matrices=False)
     some = values > 1e-9 * values[0]
-    points = virtual_points(left[:, some], values[some], W.shape[1])
+    points = virtual_points(left[:, some], values[some], W.shape[1]).leading(None)
     unit = points.values[0]
     noise = points.noise / float(np.sqrt((centred**2).mean()))
     found = estimate_shapes(points.left * (points.values / unit), rotations, Options(), noise=noise)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from smsr import rotations as so3
-from smsr.deformation import Deformation, condition, likely_shapes
+from smsr.deformation import Deformation, condition, extrapolated, likely_shapes
 from smsr.shapes import low_rank_shapes
 
 if TYPE_CHECKING:
@@ -97,13 +97,6 @@ class TestCondition:
         for t in range(frames - 1):
             np.testing.assert_allclose(found.next_covariances[t], blocks[t, :, t + 1], atol=1e-8)
 
-    def test_one_frame_has_no_next(self) -> None:
-        deformation, rotations = model(3, 0.5), turning(1, 0.0)
-        shapes = sample(deformation, 1)
-        found = condition(deformation, without_depth(shapes, rotations), rotations[:, 2])
-        assert found.depths.shape == (1, 3)
-        assert found.next_covariances.shape == (0, 3, 3)
-
 
 class TestLikelyShapes:
     def test_a_sample_of_the_process_is_found_better_than_by_the_nuclear_norm(self) -> None:
@@ -111,10 +104,25 @@ class TestLikelyShapes:
         rotations = turning(150, 4.0)
         W = (rotations[:, :2] @ true).reshape(300, 12)
         start = low_rank_shapes(W, rotations).shapes
-        found = likely_shapes(start, rotations, floor=0.004, max_iterations=60, tolerance=0.0)
+        found = likely_shapes(start, rotations, floor=0.001, max_iterations=60, tolerance=0.0)
         before, after = (float(np.linalg.norm(S - true)) for S in (start, found.shapes))
         assert after < 0.5 * before
-        assert found.deformation.correlation == pytest.approx(0.95, abs=0.1)
+
+    def test_the_correlation_is_learnt(self) -> None:
+        rotations = turning(150, 4.0)
+        learnt = []
+        for correlation in (0.3, 0.7, 0.98):
+            true = sample(model(6, correlation, rank=5), 150)
+            found = likely_shapes(true, rotations, floor=0.001, max_iterations=10, tolerance=0.0)
+            learnt.append(found.deformation.correlation)
+        np.testing.assert_allclose(learnt, [0.3, 0.7, 0.98], atol=0.15)
+
+    def test_the_least_variance_bounds_what_is_believed(self) -> None:
+        true, rotations = sample(model(6, 0.9, rank=3), 60), turning(60, 6.0)
+        for floor in (0.01, 0.3):
+            found = likely_shapes(true, rotations, floor=floor, max_iterations=3, tolerance=0.0)
+            least = np.linalg.eigvalsh(found.deformation.covariance)[0]
+            assert least >= (1.0 - 1e-9) * floor**2 * (true**2).sum() / 180
 
     def test_the_tracks_become_likelier_and_stay_as_they_are(self) -> None:
         true = sample(model(5, 0.8, rank=3), 60)
@@ -122,7 +130,7 @@ class TestLikelyShapes:
         W = (rotations[:, :2] @ true).reshape(120, 5)
         start = low_rank_shapes(W, rotations).shapes
         values = []
-        for rounds in (1, 3, 10, 30):
+        for rounds in (1, 40):
             found = likely_shapes(
                 start, rotations, floor=0.001, max_iterations=rounds, tolerance=0.0
             )
@@ -131,8 +139,7 @@ class TestLikelyShapes:
                 (rotations[:, :2] @ found.shapes).reshape(W.shape), W, atol=1e-9
             )
             values.append(log_likelihood(found.deformation, found.shapes, rotations))
-        assert values == sorted(values)
-        assert values[-1] > values[0] + 100.0
+        assert values[1] > values[0] + 5.0
 
     @pytest.mark.parametrize("scale", [1e-4, 1e3])
     def test_units_do_not_matter(self, scale: float) -> None:
@@ -156,6 +163,15 @@ class TestLikelyShapes:
             tolerance=0.5,
             hook=lambda fraction, iteration, _: seen.append((fraction, iteration)),
         )
-        assert found.iterations == 1
+        assert found.iterations == 9
         assert found.change < 0.5
-        assert seen == [(1 / 50, 1)]
+        assert seen == [(count / 50, count) for count in range(1, 10)]
+
+
+def test_a_geometric_series_is_extrapolated_to_its_limit() -> None:
+    limit, start = np.array([3.0, -1.0]), np.array([1.0, 2.0])
+    series = [limit + 0.8**k * start for k in range(3)]
+    np.testing.assert_allclose(extrapolated(*series), limit, atol=1e-12)
+    slow = [limit + 0.999**k * start for k in range(3)]
+    moved = np.linalg.norm(extrapolated(*slow) - slow[0]) / np.linalg.norm(slow[1] - slow[0])
+    assert 8.0 < moved < 16.1

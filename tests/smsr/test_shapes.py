@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from smsr import rotations as so3
+from smsr.deformation import LikelyShapes, likely_shapes
+from smsr.options import Options
 from smsr.shapes import (
     DepthProblem,
     ShapeEstimate,
     basis_size_of,
     credible_depth,
+    estimate_shapes,
     flicker,
     low_rank_shapes,
     motion_scale,
@@ -292,6 +295,31 @@ class TestLikelyDepth:
     def test_it_counts_less_where_there_was_noise(self) -> None:
         assert self.moved(noise=0.1) == 0.0
         assert 0.0 < self.moved(noise=0.09) < self.moved()
+
+    def test_slow_starts_are_waited_for(self) -> None:
+        W, rotations, shapes = sequence(points=60, modes=4)
+        found = reweighted_shapes(W, rotations)
+        likely = with_likely_depth(found, rotations)
+        assert relative_error(likely.shapes, shapes) < 0.9 * relative_error(found.shapes, shapes)
+
+    def test_with_noise_more_variance_is_allowed_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        floors = []
+
+        def spy(*args: Any, floor: float, **rest: Any) -> LikelyShapes:
+            floors.append(floor)
+            return likely_shapes(*args, floor=floor, **rest)
+
+        monkeypatch.setattr("smsr.shapes.likely_shapes", spy)
+        self.moved()
+        self.moved(noise=0.05)
+        assert floors[1] > 2.0 * floors[0]
+
+    @pytest.mark.parametrize(("share", "refined"), [(0.1, 1), (0.5, 2), (0.9, 1), (1.0, 1)])
+    def test_depths_of_little_weight_are_not_refined(self, share: float, refined: int) -> None:
+        W, rotations, _ = sequence(modes=4)
+        free = so3.exp(np.full((40, 3), 0.01)) @ rotations
+        found = estimate_shapes(W, rotations, Options(), simpler=free, simpler_share=share)
+        assert found.reason.count("Gaussian") == refined
 
     def test_weak_directions_keep_their_depth(self) -> None:
         W, rotations, _ = sequence(points=40, modes=4)
