@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import os
 import statistics
 import subprocess
 import sys
@@ -32,12 +33,12 @@ import redis
 from rq import Queue, Worker
 from rq.job import JobStatus
 from rq.serializers import JSONSerializer
-from threadpoolctl import threadpool_limits
 
 import smsr
 from benchmarks.scaling import redis_server, service
 from smsr.synthetic import make_low_rank
 from smsr_client import Client
+from worker.pool import THREAD_VARIABLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -61,7 +62,6 @@ def solve(path: str) -> float:
 
 def work_bare(url: str) -> None:
     """Be one bare RQ worker: forks a process for each job, as RQ does by default."""
-    threadpool_limits(1)
     # Loaded once, before the forks: else each job would load all of it again.
     for module in ("benchmarks.load", "smsr.pipeline"):
         importlib.import_module(module)
@@ -76,7 +76,9 @@ def bare_workers(url: str, count: int) -> Iterator[None]:
     """Run bare workers until the block ends."""
     command = [sys.executable, "-m", "benchmarks.load", "--bare-worker", url]
     root = Path(__file__).parents[1]
-    workers = [subprocess.Popen(command, cwd=root) for _ in range(count)]
+    # As the service's: threads of BLAS that exist when a process forks slow down what it forks.
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
+    workers = [subprocess.Popen(command, cwd=root, env=environment) for _ in range(count)]
     try:
         with redis.Redis.from_url(url) as connection:
             while len(Worker.all(connection=connection)) < count:
