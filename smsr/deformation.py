@@ -137,8 +137,6 @@ def likely_shapes(
     posterior = Posterior(depths, certain, certain[1:])
     deformation = Deformation(flat.mean(axis=0), np.eye(3 * points), _FIRST_CORRELATION)
     deformation = _learn(deformation, shapes, axis, posterior, variance, keep_correlation=True)
-    change = 0.0
-    iteration = 0
     latest = [depths]
     for iteration in range(1, max_iterations + 1):
         posterior = condition(deformation, planar, axis)

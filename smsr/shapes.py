@@ -617,10 +617,16 @@ def rigid_shapes(
     )
 
 
+def faded(value: float, limits: tuple[float, float]) -> float:
+    """Return 1 up to the first limit, 0 from the second on, and evenly less between them."""
+    low, high = limits
+    return min(max((high - value) / (high - low), 0.0), 1.0)
+
+
 LIKELY = (0.55, 0.75)
 """Complexities between which the likely depths lose their part."""
 
-_LITTLE = 0.25  # part of depths that is not worth the time: refining it changes them by a percent
+_LITTLE = 0.25  # part of the depths below which refining it is not worth the time
 _LIKELY_NOISE = 0.1  # part of the tracks' spread
 _LIKELY_DIRECTIONS = 24
 _LIKELY_FLOOR = 0.0008
@@ -658,8 +664,7 @@ def with_likely_depth(
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    low, high = LIKELY
-    part = min(max((high - estimate.complexity) / (high - low), 0.0), 1.0)
+    part = faded(estimate.complexity, LIKELY)
     part *= max(1.0 - noise / _LIKELY_NOISE, 0.0)
     part *= 1.0 - estimate.flicker / _MOST_BY_HASTE
     # The more frames there are, the surer is each round, and the longer it takes.
@@ -727,8 +732,7 @@ def with_deep_shapes(
     noise : float
         As a part of the tracks' spread: the more there was, the less does simplicity say.
     """
-    low, high = _DEEP
-    part = min(max((high - deep.complexity) / (high - low), 0.0), 1.0) * _trust(noise)
+    part = faded(deep.complexity, _DEEP) * _trust(noise)
     if part == 0.0:
         return estimate
     seen = rotations @ deep.shapes
@@ -814,8 +818,7 @@ def credible_depth(estimate: ShapeEstimate, rotations: NDArray[np.float64]) -> S
     seen = rotations @ estimate.shapes
     depth, image = (seen[:, 2] ** 2).mean(), (seen[:, :2] ** 2).mean()
     ratio = math.sqrt(depth / max(image, np.finfo(float).tiny))
-    low, high = FLAT
-    keep = min(max((high - estimate.complexity) / (high - low), 0.0), 1.0)
+    keep = faded(estimate.complexity, FLAT)
     keep *= min(1.0, _DEEPEST / max(ratio, np.finfo(float).tiny))
     if keep == 1.0:
         return estimate

@@ -28,6 +28,7 @@ from worker import tracing
 from worker.connections import connect
 from worker.logs import configure_logging
 from worker.maintenance import Maintenance
+from worker.pool import THREAD_VARIABLES
 from worker.processes import die_with_parent
 from worker.queue import JobQueue
 from worker.scratch import scratch_folder, sweep_scratch
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkProcess
     from pathlib import Path
 
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _AGAIN_SECONDS = (0.2, 0.5, 1.0, 2.0)
 _SWEEP_SECONDS = 60.0
 
@@ -116,7 +116,7 @@ def _worker_name() -> str:
 
 def _prepare_for_forks(threads: int) -> None:
     """Load what work-horses need, once: a fork then takes milliseconds and shares the memory."""
-    for variable in _THREAD_VARIABLES:
+    for variable in THREAD_VARIABLES:
         os.environ[variable] = str(threads)
     for module in ("worker.task", "smsr.pipeline"):
         importlib.import_module(module)

@@ -24,10 +24,13 @@ from threadpoolctl import threadpool_limits
 
 from smsr.alignment import orthogonal_factor
 from smsr.files import open_array
+from smsr.lifting import denoised_lifting
+from smsr.measurements import as_source
 from smsr.noise import virtual_points
 from smsr.options import Options
 from smsr.pipeline import reconstruct
 from smsr.rotations import complete
+from smsr.rowspace import factorise
 from smsr.shapes import estimate_shapes
 
 if TYPE_CHECKING:
@@ -286,14 +289,12 @@ def with_true_cameras(W: Array, rotations: Array) -> Array:
         Cameras completed by the viewing direction.
     """
     centred = W - W.mean(axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(centred, full_matrices=False)
-    some = values > 1e-9 * values[0]
-    points = virtual_points(left[:, some], values[some], W.shape[1]).leading(None)
+    space = factorise(as_source(W))
+    points = virtual_points(space.left, space.singular_values, space.points).leading()
     unit = points.values[0]
     noise = points.noise / float(np.sqrt((centred**2).mean()))
-    found = estimate_shapes(points.left * (points.values / unit), rotations, Options(), noise=noise)
-    shapes: Array = found.shapes @ (unit * points.coordinates @ centred)
-    return shapes
+    found = estimate_shapes(points.measurements / unit, rotations, Options(), noise=noise)
+    return denoised_lifting(unit * found.shapes, points.coordinates).apply(centred)
 
 
 def measure_member(folder: Path, key: Key) -> Member:

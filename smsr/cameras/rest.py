@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smsr import rotations as so3
+from smsr.shapes import faded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,8 +44,7 @@ class Rest:
     @property
     def trust(self) -> float:
         """How much of the turns to apply, 0 to 1: all where points rest, nothing where none do."""
-        low, high = _RESTING
-        return min(max((high - self.unrest) / (high - low), 0.0), 1.0)
+        return faded(self.unrest, _RESTING)
 
 
 def resting_frame(shapes: NDArray[np.float64]) -> Rest:

@@ -19,7 +19,7 @@ from smsr.cameras.rigid import RIGID_REST, rigid_cameras
 from smsr.cameras.trial import Trial
 from smsr.cameras.turn import refine_velocity
 from smsr.progress import ignore, part_of
-from smsr.shapes import by_turn_speed
+from smsr.shapes import by_turn_speed, faded
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -240,8 +240,7 @@ def _on_path(
     criteria: Mapping[str, float],
 ) -> CameraEstimate:
     """Return the cameras of an accepted path."""
-    low, high = SIMPLER
-    share = min(max((high - verdict.simplicity) / (high - low), 0.0), 1.0)
+    share = faded(verdict.simplicity, SIMPLER)
     least = LEAST_SHARE
     if path.is_loose:
         least = 1.0
