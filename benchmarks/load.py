@@ -33,6 +33,7 @@ import redis
 from rq import Queue, Worker
 from rq.job import JobStatus
 from rq.serializers import JSONSerializer
+from threadpoolctl import threadpool_limits
 
 import smsr
 from benchmarks.scaling import redis_server, service
@@ -65,6 +66,7 @@ def work_bare(url: str) -> None:
     # Loaded once, before the forks: else each job would load all of it again.
     for module in ("benchmarks.load", "smsr.pipeline"):
         importlib.import_module(module)
+    threadpool_limits(1)  # as in the service, for all jobs: looking for the libraries takes time
     with redis.Redis.from_url(url) as connection:
         worker = Worker([Queue("bare", connection=connection)], serializer=JSONSerializer)
         worker.log_result_lifespan = False
