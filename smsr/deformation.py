@@ -14,21 +14,26 @@ A. Hertzmann, C. Bregler (PAMI 2008) model basis weights so; here the whole shap
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from smsr.progress import ignore
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from smsr.lengths import Evidence, Lengths
     from smsr.progress import StageHook
 
 _FIRST_CORRELATION = 0.9
 _MOST_CORRELATION = 0.9999
-_FEWEST_ROUNDS = 9
+_FEWEST_ROUNDS = 9  # without lengths
+_FEWEST_MORE = 3  # with them
+_ROUNDS_WITHOUT_LENGTHS = 0.6  # of all, at most
 _FARTHEST = 8.0  # steps that an extrapolation goes at once
 
 
@@ -88,12 +93,15 @@ class LikelyShapes:
         Rounds of expectation and maximisation.
     change : float
         Of the depths in the last round, as a part of the deformation.
+    support : float
+        See `smsr.lengths.Evidence`; 0 without lengths.
     """
 
     shapes: NDArray[np.float64]
     deformation: Deformation
     iterations: int
     change: float
+    support: float = 0.0
 
 
 def likely_shapes(
@@ -103,9 +111,10 @@ def likely_shapes(
     floor: float,
     max_iterations: int,
     tolerance: float,
+    lengths: Lengths | None = None,
     hook: StageHook = ignore,
 ) -> LikelyShapes:
-    """Move the depths of shapes to where the tracks are likelier.
+    """Move the depths of shapes to where the tracks are likelier, and lengths keep.
 
     Every third round is extrapolated. Rounds are few on purpose: the likelihood of a model with so
     many parameters goes on rising after the depths have become worse.
@@ -123,6 +132,9 @@ def likely_shapes(
         Most rounds, at least 1.
     tolerance : float
         Change of the depths in a round, as a part of the deformation, at which to stop.
+    lengths : Lengths, optional
+        Distances between points, some of which keep. They take part once the depths have settled
+        without them.
     hook : callable
         See `smsr.progress.StageHook`.
     """
@@ -138,20 +150,32 @@ def likely_shapes(
     deformation = Deformation(flat.mean(axis=0), np.eye(3 * points), _FIRST_CORRELATION)
     deformation = _learn(deformation, shapes, axis, posterior, variance, keep_correlation=True)
     latest = [depths]
+    # Lengths hold on to depths that they find, so those come first that the process alone finds.
+    without = 1.0 if lengths is None else _ROUNDS_WITHOUT_LENGTHS
+    joins = math.ceil(without * max_iterations)
+    fewest, support = _FEWEST_ROUNDS, 0.0
     for iteration in range(1, max_iterations + 1):
-        posterior = condition(deformation, planar, axis)
+        evidence = None
+        if lengths is not None and iteration > joins:
+            evidence = lengths.evidence(latest[-1])
+            support = evidence.support
+        posterior = condition(deformation, planar, axis, evidence)
         change = float(np.linalg.norm(posterior.depths - latest[-1])) / size
         latest.append(posterior.depths)
         hook(iteration / max_iterations, iteration, change)
         # The first steps are as small as the least variance is, whatever is still to come.
-        if iteration == max_iterations or (iteration >= _FEWEST_ROUNDS and change < tolerance):
+        settled = iteration >= fewest and change < tolerance
+        if iteration == max_iterations or (settled and (lengths is None or iteration > joins)):
             break
+        if settled or iteration == joins:
+            joins = min(joins, iteration)
+            fewest = joins + _FEWEST_MORE
         if len(latest) == 3:
             latest = [extrapolated(*latest)]
         shapes = planar + axis[:, :, None] * latest[-1][:, None]
         deformation = _learn(deformation, shapes, axis, posterior, variance)
     shapes = planar + axis[:, :, None] * latest[-1][:, None]
-    return LikelyShapes(shapes, deformation, iteration, change)
+    return LikelyShapes(shapes, deformation, iteration, change, support)
 
 
 def extrapolated(
@@ -175,7 +199,10 @@ def extrapolated(
 
 
 def condition(
-    deformation: Deformation, planar: NDArray[np.float64], axis: NDArray[np.float64]
+    deformation: Deformation,
+    planar: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    evidence: Evidence | None = None,
 ) -> Posterior:
     """Return the depths given all that the cameras see.
 
@@ -190,6 +217,8 @@ def condition(
         The shapes of zero depth, R^+ W, T >= 2.
     axis : ndarray of shape (T, 3)
         Viewing directions.
+    evidence : Evidence, optional
+        What is known of the depths beside.
     """
     frames, _, points = planar.shape
     here, ahead = _temporal_precision(frames, deformation.correlation)
@@ -202,26 +231,45 @@ def condition(
     force[:-1] += ahead * pull[1:]
     force[1:] += ahead * pull[:-1]
     force = -np.matmul(axis[:, None], force.reshape(frames, 3, points))[:, 0]
+    if evidence is not None:
+        diagonal += evidence.precision
+        force += evidence.force
 
     inverses = np.empty_like(diagonal)
     gains = np.empty_like(coupling)
     depths = np.empty_like(force)
+    below = np.tri(points, dtype=bool)
+    block, right = diagonal[0], force[0]
     for t in range(frames):
-        block, right = diagonal[t], force[t]
-        if t > 0:
-            block = block - coupling[t - 1].T @ gains[t - 1]
-            right = right - coupling[t - 1].T @ depths[t - 1]
-        inverses[t] = np.linalg.inv(block)
-        depths[t] = inverses[t] @ right
+        inverses[t] = inverse = _inverse(block, below)
+        depths[t] = inverse @ right
         if t < frames - 1:
-            gains[t] = inverses[t] @ coupling[t]
+            gains[t] = inverse @ coupling[t]
+            back = coupling[t].T
+            block = diagonal[t + 1] - back @ gains[t]
+            right = force[t + 1] - back @ depths[t]
     covariances = inverses
     next_covariances = np.empty_like(coupling)
     for t in range(frames - 2, -1, -1):
         depths[t] -= gains[t] @ depths[t + 1]
-        next_covariances[t] = -gains[t] @ covariances[t + 1]
-        covariances[t] -= next_covariances[t] @ gains[t].T
+        np.matmul(gains[t], covariances[t + 1], out=next_covariances[t])
+        covariances[t] += next_covariances[t] @ gains[t].T
+    np.negative(next_covariances, out=next_covariances)
     return Posterior(depths, covariances, next_covariances)
+
+
+def _inverse(matrix: NDArray[np.float64], below: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the inverse of a symmetric positive definite matrix, near it where it is not.
+
+    By its Cholesky factor, which takes half the time of a general inverse. `below` is true on and
+    below the diagonal.
+    """
+    factor, failed = dpotrf(matrix, lower=1, clean=0)
+    if failed:
+        return np.asarray(np.linalg.pinv(matrix, hermitian=True), dtype=np.float64)
+    lower, _ = dpotri(factor, lower=1, overwrite_c=1)
+    inverse: NDArray[np.float64] = np.where(below, lower, lower.T)
+    return inverse
 
 
 def _learn(

@@ -197,6 +197,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             simpler=estimate.simpler,
             simpler_share=estimate.simpler_share,
             noise=noise,
+            points=real,
             hook=hook,
         )
         clock.note(found)

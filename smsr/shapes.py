@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from smsr.deformation import likely_shapes
+from smsr.lengths import Lengths, chosen_points
 from smsr.progress import ignore, part_of
 from smsr.proximal import singular_value_threshold, singular_values
 
@@ -276,6 +277,7 @@ def estimate_shapes(
     simpler: NDArray[np.float64] | None = None,
     simpler_share: float = 0.0,
     noise: float = 0.0,
+    points: NDArray[np.float64] | None = None,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
     """Find the shapes of all frames in the way that the options ask for.
@@ -297,6 +299,8 @@ def estimate_shapes(
         See `smsr.cameras.CameraEstimate`.
     noise : float
         Standard deviation of the noise that was taken off, as a part of the tracks' spread.
+    points : ndarray of shape (N, n), optional
+        Some real points in terms of the columns of W, where these are virtual ones.
     hook : callable
         See `smsr.progress.StageHook`.
     """
@@ -310,6 +314,7 @@ def estimate_shapes(
             camera_model=camera_model,
             coherent=coherent,
             noise=noise,
+            points=points,
             hook=hook,
         )
         return dataclasses.replace(found, shapes=turned_to(found.shapes, simpler, rotations))
@@ -343,7 +348,12 @@ def estimate_shapes(
         first, second = part_of(hook, 0.0, 0.6), part_of(hook, 0.6, 1.0)
         found = reweighted_shapes(measurements, cameras, deep=deep, **limits | {"hook": first})
         return with_likely_depth(
-            found, cameras, noise, max_iterations=options.shape_iterations, hook=second
+            found,
+            cameras,
+            noise,
+            points=points,
+            max_iterations=options.shape_iterations,
+            hook=second,
         )
 
     if simpler is None or share == 0.0:
@@ -627,14 +637,14 @@ LIKELY = (0.55, 0.75)
 """Complexities between which the likely depths lose their part."""
 
 _LITTLE = 0.25  # part of the depths below which refining it is not worth the time
-_LIKELY_NOISE = 0.1  # part of the tracks' spread
+_LIKELY_NOISE = 0.2  # part of the tracks' spread
 _LIKELY_DIRECTIONS = 24
 _LIKELY_FLOOR = 0.0008
 _FLOOR_BY_NOISE = 0.07
 _LIKELY_TOLERANCE = 5e-4
-_LEAST_ROUNDS = 10
-_MOST_ROUNDS = 40
-_FRAMES_IN_ALL_ROUNDS = 40_000
+_LEAST_ROUNDS = 20
+_MOST_ROUNDS = 60
+_FRAMES_IN_ALL_ROUNDS = 60_000
 
 
 def with_likely_depth(
@@ -642,14 +652,15 @@ def with_likely_depth(
     rotations: NDArray[np.float64],
     noise: float = 0.0,
     *,
+    points: NDArray[np.float64] | None = None,
     max_iterations: int = 1000,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
     """Return the shapes with depths that are likelier under a Gaussian model of the deformation.
 
-    See `smsr.deformation`. The depths count less where depth is doubtful, where noise was taken off
-    (what is left of it looks like deformation), and where the motion flickered, of which the model
-    knows nothing.
+    See `smsr.deformation` and `smsr.lengths`. The depths count less where depth is doubtful and
+    where noise was taken off (what is left of it looks like deformation). Of motion that flickered
+    the Gaussian model knows nothing: there lengths count more, and where none keep, depths less.
 
     Parameters
     ----------
@@ -659,6 +670,8 @@ def with_likely_depth(
         Cameras completed by the viewing direction.
     noise : float
         Standard deviation of the noise that was taken off, as a part of the tracks' spread.
+    points : ndarray of shape (q, n), optional
+        Some real points in terms of the q that the shapes have; without it, these are real.
     max_iterations : int
         Of all, those that the estimate took included.
     hook : callable
@@ -666,7 +679,6 @@ def with_likely_depth(
     """
     part = faded(estimate.complexity, LIKELY)
     part *= max(1.0 - noise / _LIKELY_NOISE, 0.0)
-    part *= 1.0 - estimate.flicker / _MOST_BY_HASTE
     # The more frames there are, the surer is each round, and the longer it takes.
     rounds = max(_LEAST_ROUNDS, min(_MOST_ROUNDS, _FRAMES_IN_ALL_ROUNDS // len(rotations)))
     rounds = min(rounds, max_iterations - estimate.iterations)
@@ -681,20 +693,34 @@ def with_likely_depth(
     flat = some.reshape(len(some), -1)
     if np.linalg.norm(flat - flat.mean(axis=0)) <= _RIGID * np.linalg.norm(flat):
         return estimate
+    if points is None:
+        points = np.eye(estimate.shapes.shape[2])
+    points = points[:, chosen_points(seen @ points)]
+    lengths = Lengths(
+        estimate.shapes @ points,
+        directions.T @ points,
+        rotations[:, 2],
+        np.matmul(rotations[:, 2][:, None], some)[:, 0],
+        noise=noise,
+        weight=1.0 + estimate.flicker,
+    )
     likely = likely_shapes(
         some,
         rotations,
+        lengths=lengths,
         floor=_LIKELY_FLOOR + _FLOOR_BY_NOISE * noise,
         max_iterations=rounds,
         tolerance=_LIKELY_TOLERANCE,
         hook=hook,
     )
+    part *= 1.0 - (1.0 - likely.support) * estimate.flicker / _MOST_BY_HASTE
     shapes = estimate.shapes + part * (likely.shapes - some) @ directions.T
     return dataclasses.replace(
         estimate,
         shapes=shapes,
         iterations=estimate.iterations + likely.iterations,
-        reason=f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them",
+        reason=f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them, "
+        f"{likely.support:.0%} of points with lengths that keep",
     )
 
 

@@ -293,7 +293,13 @@ def with_true_cameras(W: Array, rotations: Array) -> Array:
     points = virtual_points(space.left, space.singular_values, space.points).leading()
     unit = points.values[0]
     noise = points.noise / float(np.sqrt((centred**2).mean()))
-    found = estimate_shapes(points.measurements / unit, rotations, Options(), noise=noise)
+    found = estimate_shapes(
+        points.measurements / unit,
+        rotations,
+        Options(),
+        noise=noise,
+        points=points.coordinates @ space.sample,
+    )
     return denoised_lifting(unit * found.shapes, points.coordinates).apply(centred)
 
 
