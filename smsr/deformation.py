@@ -134,7 +134,7 @@ def likely_shapes(
         Change of the depths in a round, as a part of the deformation, at which to stop.
     lengths : Lengths, optional
         Distances between points, some of which keep. They take part once the depths have settled
-        without them.
+        without them, and from three fifths of the rounds on anyway.
     hook : callable
         See `smsr.progress.StageHook`.
     """
@@ -150,7 +150,7 @@ def likely_shapes(
     deformation = Deformation(flat.mean(axis=0), np.eye(3 * points), _FIRST_CORRELATION)
     deformation = _learn(deformation, shapes, axis, posterior, variance, keep_correlation=True)
     latest = [depths]
-    # Lengths hold on to depths that they find, so those come first that the process alone finds.
+    # Lengths hold on to depths that they find: a face that still was too flat stayed so.
     without = 1.0 if lengths is None else _ROUNDS_WITHOUT_LENGTHS
     joins = math.ceil(without * max_iterations)
     fewest, support = _FEWEST_ROUNDS, 0.0
@@ -170,6 +170,7 @@ def likely_shapes(
         if settled or iteration == joins:
             joins = min(joins, iteration)
             fewest = joins + _FEWEST_MORE
+            latest = latest[-1:]
         if len(latest) == 3:
             latest = [extrapolated(*latest)]
         shapes = planar + axis[:, :, None] * latest[-1][:, None]
@@ -266,7 +267,9 @@ def _inverse(matrix: NDArray[np.float64], below: NDArray[np.bool_]) -> NDArray[n
     """
     factor, failed = dpotrf(matrix, lower=1, clean=0)
     if failed:
-        return np.asarray(np.linalg.pinv(matrix, hermitian=True), dtype=np.float64)
+        values, vectors = np.linalg.eigh(matrix)
+        values = np.maximum(values, np.finfo(float).eps * np.abs(values).max())
+        return np.asarray(vectors / values @ vectors.T, dtype=np.float64)
     lower, _ = dpotri(factor, lower=1, overwrite_c=1)
     inverse: NDArray[np.float64] = np.where(below, lower, lower.T)
     return inverse

@@ -42,7 +42,8 @@ class Evidence:
     force : ndarray of shape (T, q)
         Precision times the depths that are likeliest by this alone.
     support : float
-        Part of the points with a distance to another one that keeps.
+        How far points have a distance to another one that keeps, 0 to 1: the mean over the points
+        of the most that one of their lengths is trusted.
     """
 
     precision: NDArray[np.float64]
@@ -54,7 +55,8 @@ class Lengths:
     """Distances between some points in all frames, as functions of the depths.
 
     A squared length is taken for normally distributed about its mean, with the variance that it
-    has at present. As pairs are not independent, those of a point count together as two.
+    has at present. As pairs are not independent, those of a point count together as two. Sizes are
+    relative to the root mean square of the coordinates of the points.
 
     Parameters
     ----------
@@ -117,23 +119,24 @@ class Lengths:
         variance = np.einsum("tm,tm->m", squares, squares) / (4.0 * len(squares) * level)
         trust = _biweight(variance / (_STEADY**2 * self._size))
         trust *= _biweight(variance / (_STEADY_BY_MOTION**2 * np.maximum(motion, tiny)))
-        of_points = np.zeros(len(mean[0]))
-        np.add.at(of_points, self._first, trust)
-        np.add.at(of_points, self._second, trust)
+        trust[level <= self._least] = 0.0  # points that coincide keep nothing
+        of_points = np.zeros(z.shape[1])
+        np.maximum.at(of_points, self._first, trust)
+        np.maximum.at(of_points, self._second, trust)
         kept = np.flatnonzero(trust)
         weights = self._weight * trust[kept] / ((variance[kept] + self._least) * 4.0 * level[kept])
         squares, slopes = squares[:, kept], 2.0 * apart[:, kept]
         curvature = weights * (slopes**2 + 2.0 * np.abs(squares))
         differences = self._differences[:, kept]
-        count = len(differences)
-        rows, columns = np.triu_indices(count)
+        q = len(differences)
+        rows, columns = np.triu_indices(q)
         triangle = curvature @ (differences[rows] * differences[columns]).T
-        precision = np.empty((len(z), count, count))
+        precision = np.empty((len(z), q, q))
         precision[:, rows, columns] = triangle
         precision[:, columns, rows] = triangle
         force = np.matmul(precision, depths[:, :, None])[:, :, 0]
         force -= (weights * slopes * squares) @ differences.T
-        return Evidence(precision, force, float(np.minimum(of_points, 1.0).mean()))
+        return Evidence(precision, force, float(of_points.mean()))
 
 
 def _biweight(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -154,8 +157,8 @@ def chosen_points(trajectories: NDArray[np.float64]) -> NDArray[np.intp]:
         Of points, less the mean.
     """
     frames, points = len(trajectories) // 2, trajectories.shape[1]
-    most = int((1.0 + np.sqrt(1.0 + 8.0 * _MOST_SQUARES / max(frames, 1))) / 2.0)
-    count = min(points, MOST_POINTS, max(most, 3))
+    most = int((1.0 + np.sqrt(1.0 + 8.0 * _MOST_SQUARES / frames)) / 2.0)
+    count = min(points, MOST_POINTS, most)
     squares = np.einsum("tn,tn->n", trajectories, trajectories)
     order = np.argsort(squares, kind="stable")
     return np.sort(order[np.linspace(0, points - 1, count).astype(np.intp)])

@@ -693,12 +693,10 @@ def with_likely_depth(
     flat = some.reshape(len(some), -1)
     if np.linalg.norm(flat - flat.mean(axis=0)) <= _RIGID * np.linalg.norm(flat):
         return estimate
-    if points is None:
-        points = np.eye(estimate.shapes.shape[2])
-    points = points[:, chosen_points(seen @ points)]
+    chosen = chosen_points(seen if points is None else seen @ points)
     lengths = Lengths(
-        estimate.shapes @ points,
-        directions.T @ points,
+        estimate.shapes[:, :, chosen] if points is None else estimate.shapes @ points[:, chosen],
+        directions[chosen].T if points is None else directions.T @ points[:, chosen],
         rotations[:, 2],
         np.matmul(rotations[:, 2][:, None], some)[:, 0],
         noise=noise,

@@ -24,8 +24,8 @@ SPARSE = {
     "pickup": 0.035,
     "stretch": 0.040,
     "yoga": 0.035,
-    "dance": 0.115,
-    "dinosaur": 0.25,
+    "dance": 0.0988,
+    "dinosaur": 0.235,
 }
 DENSE = {"facecap": 0.025, "samba": 0.14}
 

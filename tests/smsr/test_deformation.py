@@ -4,9 +4,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from smsr import rotations as so3
 from smsr.deformation import Deformation, condition, extrapolated, likely_shapes
+from smsr.lengths import Evidence, Lengths
 from smsr.shapes import low_rank_shapes
 
 if TYPE_CHECKING:
@@ -96,6 +98,67 @@ class TestCondition:
             np.testing.assert_allclose(found.covariances[t], blocks[t, :, t], atol=1e-8)
         for t in range(frames - 1):
             np.testing.assert_allclose(found.next_covariances[t], blocks[t, :, t + 1], atol=1e-8)
+
+    def test_evidence_adds_to_it(self) -> None:
+        frames, points = 5, 3
+        deformation, rotations = model(points, 0.8), turning(5, 20.0)
+        shapes = sample(deformation, frames)
+        rng = np.random.default_rng(3)
+        factors = rng.standard_normal((frames, points, points))
+        extra = Evidence(
+            factors @ factors.transpose(0, 2, 1), rng.standard_normal((frames, points)), 1.0
+        )
+        planar, axis = without_depth(shapes, rotations), rotations[:, 2]
+        prior = condition(deformation, planar, axis)
+        joint = np.kron(temporal_covariance(frames, 0.8), deformation.covariance)
+        look = np.zeros((frames * points, frames * 3 * points))
+        for t, direction in enumerate(axis):
+            rows, columns = slice(t * 3, t * 3 + 3), slice(t * 9, t * 9 + 9)
+            look[rows, columns] = np.kron(direction, np.eye(points))
+        precision = look @ np.linalg.inv(joint) @ look.T
+        both = precision + block_diag(*extra.precision)
+        right = precision @ prior.depths.ravel() + extra.force.ravel()
+        found = condition(deformation, planar, axis, extra)
+        np.testing.assert_allclose(found.depths.ravel(), np.linalg.solve(both, right), atol=1e-8)
+        covariance = np.linalg.inv(both).reshape(frames, points, frames, points)
+        np.testing.assert_allclose(found.covariances[2], covariance[2, :, 2], atol=1e-8)
+        np.testing.assert_allclose(found.next_covariances[2], covariance[2, :, 3], atol=1e-8)
+
+    def test_a_precision_that_is_none_has_no_negative_variance(self) -> None:
+        deformation, rotations = model(3, 0.8), turning(5, 20.0)
+        planar = without_depth(sample(deformation, 5), rotations)
+        negative = Evidence(np.broadcast_to(-1e9 * np.eye(3), (5, 3, 3)), np.zeros((5, 3)), 0.0)
+        found = condition(deformation, planar, rotations[:, 2], negative)
+        assert np.isfinite(found.depths).all()
+        assert np.linalg.eigvalsh(found.covariances[-1]).min() > 0.0
+
+
+class Spy(Lengths):
+    """Lengths that say nothing, and how often they were asked."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def evidence(self, depths: Array) -> Evidence:
+        self.asked += 1
+        frames, points = depths.shape
+        return Evidence(np.zeros((frames, points, points)), np.zeros((frames, points)), 0.25)
+
+
+@pytest.mark.parametrize(
+    ("rounds", "tolerance", "taken", "with_lengths"),
+    [(60, 1.0, 12, 3), (60, 0.0, 60, 24), (10, 0.0, 10, 4), (2, 0.0, 2, 0), (1, 0.0, 1, 0)],
+)
+def test_lengths_join_when_depths_have_settled(
+    rounds: int, tolerance: float, taken: int, with_lengths: int
+) -> None:
+    true, rotations = sample(model(6, 0.9, rank=3), 30), turning(30, 6.0)
+    spy = Spy()
+    found = likely_shapes(
+        true, rotations, floor=0.01, max_iterations=rounds, tolerance=tolerance, lengths=spy
+    )
+    assert (found.iterations, spy.asked) == (taken, with_lengths)
+    assert found.support == (0.25 if with_lengths else 0.0)
 
 
 class TestLikelyShapes:

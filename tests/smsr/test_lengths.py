@@ -104,6 +104,27 @@ class TestEvidence:
         found = lengths_of(half, rotations).evidence(split(half, rotations)[1])
         assert 0.4 < found.support < 0.6
 
+    def test_points_that_coincide_are_no_support(self) -> None:
+        rotations = turning(40, 5.0)
+        loose = np.random.default_rng(0).standard_normal((40, 3, 12))
+        doubled = np.concatenate([loose, loose + 1e-9], axis=2)
+        found = lengths_of(doubled, rotations).evidence(split(doubled, rotations)[1])
+        assert found.support == 0.0
+
+    def test_steps_are_short_where_a_pair_lies_in_the_image_plane(self) -> None:
+        rotations = turning(40, 5.0)
+        limb = np.repeat(np.array([[[-1.0, 1.0], [0.2, -0.2], [0.0, 0.0]]]), 40, axis=0)
+        depths = split(limb, rotations)[1]
+        lengths = lengths_of(limb, rotations)
+        flat = int(np.abs(np.abs(depths[:, 0] - depths[:, 1]) - 0.3).argmin())
+        wrong = depths.copy()
+        wrong[flat] = [1e-4, -1e-4]
+        found = lengths.evidence(wrong)
+        assert found.precision[flat].any()
+        likeliest = np.linalg.pinv(found.precision[flat], hermitian=True) @ found.force[flat]
+        step = likeliest - (wrong[flat] - wrong[flat].mean())
+        assert np.abs(step).max() < 0.3
+
     def test_noise_makes_it_weaker(self) -> None:
         rotations = turning(20, 5.0)
         shapes = limbs(20)

@@ -8,6 +8,7 @@ import pytest
 
 from smsr import rotations as so3
 from smsr.deformation import LikelyShapes, likely_shapes
+from smsr.lengths import Lengths, chosen_points
 from smsr.options import Options
 from smsr.shapes import (
     DepthProblem,
@@ -303,6 +304,28 @@ class TestLikelyDepth:
     def test_it_counts_less_where_there_was_noise(self) -> None:
         assert self.moved(noise=0.2) == 0.0
         assert 0.0 < self.moved(noise=0.19) < 0.2 * self.moved()
+
+    def test_lengths_are_told_of_noise_and_flicker_and_of_some_points(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        told = []
+
+        def spy(shapes: Array, *args: Any, noise: float, weight: float) -> Lengths:
+            told.append((noise, weight, shapes))
+            return Lengths(shapes, *args, noise=noise, weight=weight)
+
+        monkeypatch.setattr("smsr.shapes.Lengths", spy)
+        self.moved(noise=0.05)
+        self.moved(flicker=1.5)
+        assert [each[:2] for each in told] == [(0.05, 1.0), (0.0, 2.5)]
+        W, rotations, true = sequence(points=100, modes=4)
+        found = dataclasses.replace(reweighted_shapes(W, rotations), shapes=true)
+        mixing = np.linalg.qr(np.random.default_rng(0).standard_normal((100, 100)))[0]
+        with_likely_depth(found, rotations, points=mixing)
+        real = true @ mixing
+        chosen = chosen_points((rotations[:, :2] @ real).reshape(80, -1))
+        assert not np.array_equal(chosen, np.arange(len(chosen)))
+        np.testing.assert_allclose(told[-1][2], real[:, :, chosen], atol=1e-12)
 
     def test_slow_starts_are_waited_for(self) -> None:
         W, rotations, shapes = sequence(points=60, modes=4)
