@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 MOST_POINTS = 64
 """Points whose distances are looked at."""
 
-_MOST_SQUARES = 2_000_000  # frames times pairs
+_MOST_SQUARES = 1_000_000  # frames times pairs
 _WEIGHT = 2.0
 _STEADY = 0.1  # standard deviation of a length as a part of the size
 _STEADY_BY_MOTION = 0.3  # and as a part of that of the difference of the two points
