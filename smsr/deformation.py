@@ -243,18 +243,19 @@ def condition(
     block, right = diagonal[0], force[0]
     for t in range(frames):
         inverses[t] = inverse = _inverse(block, below)
-        depths[t] = inverse @ right
+        depths[t] = depth = inverse @ right
         if t < frames - 1:
-            gains[t] = inverse @ coupling[t]
+            gain = np.matmul(inverse, coupling[t], out=gains[t])
             back = coupling[t].T
-            block = diagonal[t + 1] - back @ gains[t]
-            right = force[t + 1] - back @ depths[t]
+            block = diagonal[t + 1] - back @ gain
+            right = force[t + 1] - back @ depth
     covariances = inverses
     next_covariances = np.empty_like(coupling)
     for t in range(frames - 2, -1, -1):
-        depths[t] -= gains[t] @ depths[t + 1]
-        np.matmul(gains[t], covariances[t + 1], out=next_covariances[t])
-        covariances[t] += next_covariances[t] @ gains[t].T
+        gain = gains[t]
+        depths[t] -= gain @ depths[t + 1]
+        following = np.matmul(gain, covariances[t + 1], out=next_covariances[t])
+        covariances[t] += following @ gain.T
     np.negative(next_covariances, out=next_covariances)
     return Posterior(depths, covariances, next_covariances)
 

@@ -91,7 +91,10 @@ class Lengths:
         present = np.matmul(axis[:, None], shapes)[:, 0]
         self._rest = present - depths @ directions
         self._planar = shapes - axis[:, :, None] * present[:, None]
-        self._seen = (self._apart(self._planar) ** 2).sum(axis=1)
+        products = np.matmul(self._planar.transpose(0, 2, 1), self._planar)
+        squares = np.einsum("tnn->tn", products)
+        seen = squares[:, :, None] + squares[:, None, :] - 2.0 * products
+        self._seen = np.maximum(seen[:, self._first, self._second], 0.0)
         self._differences = self._apart(directions)
         self._size = float((shapes**2).mean())
         self._least = (_FLOOR**2 + noise**2) * self._size
@@ -99,7 +102,12 @@ class Lengths:
 
     def _apart(self, of_points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return differences (..., pairs) of what belongs to points (..., n)."""
-        return of_points[..., self._first] - of_points[..., self._second]
+        # Much faster than by an index.
+        first, second = (
+            np.take(of_points, which, axis=-1) for which in (self._first, self._second)
+        )
+        difference: NDArray[np.float64] = first - second
+        return difference
 
     def evidence(self, depths: NDArray[np.float64]) -> Evidence:
         """Return what the lengths say of the depths, near given ones (T, q).
@@ -125,7 +133,7 @@ class Lengths:
         np.maximum.at(of_points, self._second, trust)
         kept = np.flatnonzero(trust)
         weights = self._weight * trust[kept] / ((variance[kept] + self._least) * 4.0 * level[kept])
-        squares, slopes = squares[:, kept], 2.0 * apart[:, kept]
+        squares, slopes = np.take(squares, kept, axis=1), 2.0 * np.take(apart, kept, axis=1)
         curvature = weights * (slopes**2 + 2.0 * np.abs(squares))
         differences = self._differences[:, kept]
         q = len(differences)

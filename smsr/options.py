@@ -128,7 +128,11 @@ class Options:
         1000, "Most iterations of the shape stage.", minimum=1, maximum=100_000
     )
     shape_tolerance: float = option(
-        1e-4, "Relative residual at which the shape stage stops.", minimum=1e-15, maximum=1.0
+        1e-4,
+        "Relative residual at which the shape stage stops; five times that before a refinement to "
+        "likely depths.",
+        minimum=1e-15,
+        maximum=1.0,
     )
     penalty: float = option(
         1.0,
