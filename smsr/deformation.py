@@ -22,6 +22,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
 
 from smsr.progress import ignore
+from smsr.rotations import depths_along
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -140,7 +141,7 @@ def likely_shapes(
     """
     frames, _, points = shapes.shape
     axis = np.ascontiguousarray(rotations[:, 2])
-    depths = np.matmul(axis[:, None], shapes)[:, 0]
+    depths = depths_along(axis, shapes)
     planar = shapes - axis[:, :, None] * depths[:, None]
     flat = shapes.reshape(frames, -1)
     size = float(np.linalg.norm(flat - flat.mean(axis=0)))
@@ -151,12 +152,11 @@ def likely_shapes(
     deformation = _learn(deformation, shapes, axis, posterior, variance, keep_correlation=True)
     latest = [depths]
     # Lengths hold on to depths that they find: a face that still was too flat stayed so.
-    without = 1.0 if lengths is None else _ROUNDS_WITHOUT_LENGTHS
-    joins = math.ceil(without * max_iterations)
+    joins = math.ceil(_ROUNDS_WITHOUT_LENGTHS * max_iterations)
     fewest, support = _FEWEST_ROUNDS, 0.0
     for iteration in range(1, max_iterations + 1):
-        evidence = None
-        if lengths is not None and iteration > joins:
+        evidence, complete = None, lengths is None or iteration > joins
+        if lengths is not None and complete:
             evidence = lengths.evidence(latest[-1])
             support = evidence.support
         posterior = condition(deformation, planar, axis, evidence)
@@ -165,12 +165,11 @@ def likely_shapes(
         hook(iteration / max_iterations, iteration, change)
         # The first steps are as small as the least variance is, whatever is still to come.
         settled = iteration >= fewest and change < tolerance
-        if iteration == max_iterations or (settled and (lengths is None or iteration > joins)):
+        if iteration == max_iterations or (settled and complete):
             break
-        if settled or iteration == joins:
-            joins = min(joins, iteration)
-            fewest = joins + _FEWEST_MORE
-            latest = latest[-1:]
+        if not complete and (settled or iteration == joins):
+            joins, fewest = iteration, iteration + _FEWEST_MORE
+            latest = latest[-1:]  # steps with and without lengths lead to different places
         if len(latest) == 3:
             latest = [extrapolated(*latest)]
         shapes = planar + axis[:, :, None] * latest[-1][:, None]
@@ -231,7 +230,7 @@ def condition(
     force = here[:, None] * pull
     force[:-1] += ahead * pull[1:]
     force[1:] += ahead * pull[:-1]
-    force = -np.matmul(axis[:, None], force.reshape(frames, 3, points))[:, 0]
+    force = -depths_along(axis, force.reshape(frames, 3, points))
     if evidence is not None:
         diagonal += evidence.precision
         force += evidence.force

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from smsr.rotations import depths_along
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -88,10 +90,11 @@ class Lengths:
         self._first, self._second = np.triu_indices(points, 1)
         self._directions = directions
         self._axis = axis
-        present = np.matmul(axis[:, None], shapes)[:, 0]
+        present = depths_along(axis, shapes)
         self._rest = present - depths @ directions
-        self._planar = shapes - axis[:, :, None] * present[:, None]
-        products = np.matmul(self._planar.transpose(0, 2, 1), self._planar)
+        planar = shapes - axis[:, :, None] * present[:, None]
+        self._mean_planar = planar.mean(axis=0)
+        products = np.matmul(planar.transpose(0, 2, 1), planar)
         squares = np.einsum("tnn->tn", products)
         seen = squares[:, :, None] + squares[:, None, :] - 2.0 * products
         self._seen = np.maximum(seen[:, self._first, self._second], 0.0)
@@ -120,7 +123,7 @@ class Lengths:
         squares = self._seen + apart**2
         level = squares.mean(axis=0)
         squares -= level
-        mean = (self._planar + self._axis[:, :, None] * z[:, None]).mean(axis=0)
+        mean = self._mean_planar + self._axis.T @ z / len(z)
         motion = level - (self._apart(mean) ** 2).sum(axis=0)
         tiny = 1e-12 * self._size
         level = np.maximum(level, tiny)

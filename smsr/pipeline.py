@@ -174,7 +174,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     unit = float(points.values[0])
     values = points.values / unit
     virtual = points.left * values
-    noise = points.noise / _spread(space)
+    noise = points.noise / space.spread
     with clock.stage("cameras") as hook:
         real = points.coordinates @ space.sample
         estimate = fix_gauge(
@@ -224,12 +224,6 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             *convergence_cautions(clock.reports),
         ),
     )
-
-
-def _spread(space: RowSpace) -> float:
-    """Return the root mean square of the centred measurements."""
-    positions = 2 * space.frames * space.points
-    return math.sqrt(float((space.singular_values**2).sum()) / positions)
 
 
 def _smooth(

@@ -21,6 +21,12 @@ def complete(cameras: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([cameras, depth[:, None]], axis=1)
 
 
+def depths_along(axis: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the depths (T, N) of shapes (T, 3, N) along directions (T, 3)."""
+    depths: NDArray[np.float64] = np.matmul(axis[:, None], shapes)[:, 0]
+    return depths
+
+
 def nearest_cameras(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the cameras (T, 2, 3) with orthonormal rows nearest to any (T, 2, 3) array.
 

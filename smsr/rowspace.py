@@ -12,6 +12,7 @@ Gram matrix W W^T would be cheaper, and would lose half of the digits of the sma
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -82,6 +83,12 @@ class RowSpace:
         """U (2T, r), the left singular vectors of the centred W."""
         vectors: NDArray[np.float64] = self.factor / self.singular_values
         return vectors
+
+    @property
+    def spread(self) -> float:
+        """Root mean square of the centred W."""
+        positions = 2 * self.frames * self.points
+        return math.sqrt(float((self.singular_values**2).sum()) / positions)
 
     @property
     def translations(self) -> NDArray[np.float64]:

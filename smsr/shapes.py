@@ -20,6 +20,7 @@ from smsr.deformation import likely_shapes
 from smsr.lengths import Lengths, chosen_points
 from smsr.progress import ignore, part_of
 from smsr.proximal import singular_value_threshold, singular_values
+from smsr.rotations import depths_along
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -146,8 +147,7 @@ class DepthProblem:
 
     def _along_axis(self, S: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the depths (T, N) of shapes (T, 3, N)."""
-        depths: NDArray[np.float64] = np.matmul(self.axis[:, None, :], S)[:, 0]
-        return depths
+        return depths_along(self.axis, S)
 
     def _with_depths(self, depths: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shapes (T, 3N) with W = R S and the given depths (T, N)."""
@@ -638,7 +638,7 @@ def faded(value: float, limits: tuple[float, float]) -> float:
 LIKELY = (0.55, 0.75)
 """Complexities between which the likely depths lose their part."""
 
-_ROUGHLY = 5.0
+_ROUGHLY = 5.0  # times the tolerance, for the start of a refinement
 _LITTLE = 0.25  # part of the depths below which refining it is not worth the time
 _LIKELY_NOISE = 0.2  # part of the tracks' spread
 _LIKELY_DIRECTIONS = 24
@@ -701,7 +701,7 @@ def with_likely_depth(
         estimate.shapes[:, :, chosen] if points is None else estimate.shapes @ points[:, chosen],
         directions[chosen].T if points is None else directions.T @ points[:, chosen],
         rotations[:, 2],
-        np.matmul(rotations[:, 2][:, None], some)[:, 0],
+        depths_along(rotations[:, 2], some),
         noise=noise,
         weight=1.0 + estimate.flicker,
     )
@@ -769,7 +769,7 @@ def with_deep_shapes(
     width *= _DEEPEST_BY_WIDTH
     depths = min(1.0, width / max(depth, np.finfo(float).tiny)) * seen[:, 2]
     axis = rotations[:, 2]
-    present = np.matmul(axis[:, None], estimate.shapes)[:, 0]
+    present = depths_along(axis, estimate.shapes)
     change = part * (depths - present)
     return dataclasses.replace(
         estimate,

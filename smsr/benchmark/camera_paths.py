@@ -288,19 +288,17 @@ def with_true_cameras(W: Array, rotations: Array) -> Array:
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     """
-    centred = W - W.mean(axis=1, keepdims=True)
     space = factorise(as_source(W))
     points = virtual_points(space.left, space.singular_values, space.points).leading()
     unit = points.values[0]
-    noise = points.noise / float(np.sqrt((centred**2).mean()))
     found = estimate_shapes(
         points.measurements / unit,
         rotations,
         Options(),
-        noise=noise,
+        noise=points.noise / space.spread,
         points=points.coordinates @ space.sample,
     )
-    return denoised_lifting(unit * found.shapes, points.coordinates).apply(centred)
+    return denoised_lifting(unit * found.shapes, points.coordinates).apply(W - space.means[:, None])
 
 
 def measure_member(folder: Path, key: Key) -> Member:

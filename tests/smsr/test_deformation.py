@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from smsr import rotations as so3
 from smsr.deformation import Deformation, condition, extrapolated, likely_shapes
 from smsr.lengths import Evidence, Lengths
 from smsr.shapes import low_rank_shapes
+from tests.limbs import turning
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,11 +37,6 @@ def sample(deformation: Deformation, frames: int, seed: int = 1) -> Array:
     in_space = np.linalg.cholesky(deformation.covariance)
     white = rng.standard_normal((frames, len(deformation.mean)))
     return (in_time @ white @ in_space.T + deformation.mean).reshape(frames, 3, -1)
-
-
-def turning(frames: int, degrees: float) -> Array:
-    angles = np.radians(degrees) * np.arange(frames)[:, None]
-    return so3.exp(angles * np.array([0.1, 1.0, 0.2]))
 
 
 def without_depth(shapes: Array, rotations: Array) -> Array:
