@@ -16,6 +16,7 @@ import numpy as np
 from smsr.errors import NotNumeric
 from smsr.progress import ignore
 from smsr.sinks import sink_for
+from smsr.streaming import blas_threads, map_chunks
 from smsr.triangles import NotUsableError, Triangle, within
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ class DeviceSource:
         dtype: np.dtype[Any],
         *,
         size: int,
-        workers: int | None,  # noqa: ARG002
+        workers: int | None,
         progress: StageHook = ignore,
     ) -> NDArray[np.floating[Any]]:
         """Make the shapes of all points, in host memory; see `smsr.rowspace.map_back`."""
@@ -102,14 +103,21 @@ class DeviceSource:
             cameras = operator.cameras
             lift = None if cameras is None else self._put(cameras.transpose(0, 2, 1))
             origin = self._put(means[:, None])
-            for index, points in enumerate(self._slices(size), 1):
-                shapes = _to_host(self._shapes(points, origin, factors, lift))
+
+            def finished() -> Iterator[Chunk]:
+                for points in self._slices(size):
+                    yield points, self._shapes(points, origin, factors, lift, sink.dtype)
+
+            def store(points: slice, shapes: NDArray[Any]) -> None:
                 target = sink.target(points)
-                if target is None:
-                    sink.write(points, np.ascontiguousarray(shapes, sink.dtype))
-                else:
+                if target is not None:
                     target[...] = shapes
-                progress(points.stop / self.points, index, None)
+                sink.write(points, shapes)
+
+            # The device is used from this thread alone, as some libraries keep its state by thread.
+            done = map_chunks(store, finished(), workers or blas_threads())
+            for index, (stop, _) in enumerate(done, 1):
+                progress(stop / self.points, index, None)
         except BaseException:
             sink.discard()
             raise
@@ -151,8 +159,10 @@ class DeviceSource:
         sample = _to_host(xp.take(centred, where, axis=1))
         return Triangle(points.stop - points.start, mean, _to_host(rows), sample)
 
-    def _shapes(self, points: slice, origin: Any, factors: list[Any], lift: Any) -> Any:
-        """Return the shapes (T, n, 3) of a block."""
+    def _shapes(
+        self, points: slice, origin: Any, factors: list[Any], lift: Any, dtype: np.dtype[Any]
+    ) -> NDArray[np.floating[Any]]:
+        """Make the shapes (T, n, 3) of a block, and bring them to the host."""
         xp = self._library
         centred = self._centred(points, origin)
         result = centred
@@ -161,7 +171,9 @@ class DeviceSource:
         result = xp.reshape(result, (self.frames, 3, -1))
         if lift is not None:
             result = result + lift @ xp.reshape(centred, (self.frames, 2, -1))
-        return xp.permute_dims(result, (0, 2, 1))
+        # In the order and precision of the host already: memory is slower there.
+        result = xp.reshape(xp.permute_dims(result, (0, 2, 1)), (-1,))
+        return _to_host(xp.astype(result, getattr(xp, dtype.name))).reshape(self.frames, -1, 3)
 
 
 def library(array: Any) -> Any:

@@ -13,6 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import scipy.linalg  # noqa: F401  # loads its own BLAS, which is to be found with that of numpy
 from threadpoolctl import ThreadpoolController
 
 from smsr.errors import WrongShape

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from scipy.linalg.lapack import dgeqrf, dgeqrf_lwork
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -159,10 +160,14 @@ def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _reduced(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return at most as many rows as columns with the same Gram matrix."""
-    if rows.shape[0] <= rows.shape[1]:
+    """Return at most as many rows as columns with the same Gram matrix; may overwrite the rows."""
+    count, width = rows.shape
+    if count <= width:
         return rows.copy()
-    return cast("NDArray[np.float64]", np.linalg.qr(rows, mode="r"))
+    # numpy's QR keeps the interpreter's lock, so that threads would wait for each other.
+    workspace = int(dgeqrf_lwork(count, width)[0])
+    factor = dgeqrf(rows, lwork=workspace, overwrite_a=True)[0]
+    return cast("NDArray[np.float64]", np.triu(factor[:width]))
 
 
 def merged(parts: Iterable[Triangle]) -> Triangle:

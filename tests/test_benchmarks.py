@@ -34,6 +34,13 @@ def test_floor(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_device() -> None:
+    options = ("--frames", "10", "--points", "3000", "--repeats", "1")
+    rows = run("device.py", "array_api_strict", *options)
+    assert [row[1] for row in rows[2:]] == ["numpy", "array_api_strict"]
+    assert all(float(row[-1]) < 1e-6 for row in rows[2:])
+
+
 def test_the_reduction_computes_the_same_as_the_whole() -> None:
     rows = run("unreduced.py", "--frames", "12", "--points", "300", "3000", "--iterations", "20")
     for row in rows[2:]:
