@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dpttrf, dpttrs
 
 from smsr.deformation import likely_shapes
 from smsr.lengths import Lengths, chosen_points
@@ -154,19 +154,18 @@ class DepthProblem:
         shapes = self.planar + self.axis[:, :, None] * depths[:, None, :]
         return shapes.reshape(self.frames, -1)
 
-    def _banded_factor(self, penalty: float, motion_weight: float) -> NDArray[np.float64]:
-        """Factor ``penalty I + motion_weight n^T D^T D n`` (tridiagonal)."""
-        banded = np.zeros((2, self.frames))
-        banded[1] = penalty + motion_weight * self._diagonal
-        banded[0, 1:] = motion_weight * self._off_diagonal
-        factor: NDArray[np.float64] = cholesky_banded(banded, check_finite=False)
-        return factor
+    def _tridiagonal_factor(
+        self, penalty: float, motion_weight: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Factor ``penalty I + motion_weight n^T D^T D n``, for `dpttrs`."""
+        diagonal = penalty + motion_weight * self._diagonal
+        factor = dpttrf(diagonal, motion_weight * self._off_diagonal)
+        return factor[0], factor[1]
 
     def start_from_least_motion(self) -> None:
         """Set the depths that move the shape least from frame to frame."""
-        factor = self._banded_factor(1e-6, 1.0)
-        depths = cho_solve_banded((factor, False), -self._planar_motion, check_finite=False)
-        self.shapes = self._with_depths(depths)
+        factor = self._tridiagonal_factor(1e-6, 1.0)
+        self.shapes = self._with_depths(dpttrs(*factor, -self._planar_motion)[0])
         self.dual[:] = 0.0
 
     def spectrum(self) -> NDArray[np.float64]:
@@ -231,14 +230,15 @@ class DepthProblem:
             self.penalty = self.FIRST_PENALTY / largest
         S, Y = self.shapes, self.dual
         Z = S
-        factor = self._banded_factor(self.penalty, self.motion_weight)
+        factor = self._tridiagonal_factor(self.penalty, self.motion_weight)
         # Reweighting gives small singular values large weights, and over-relaxed steps may cycle.
         convex = np.ndim(self.weights) == 0
         first_penalty = self.penalty
         relaxation = self.RELAXATION if convex else 1.0
         for iteration in range(1, max_iterations + 1):
-            relaxed = relaxation * S + (1.0 - relaxation) * Z
-            X = relaxed + Y
+            X = S + Y
+            if relaxation != 1.0:
+                X += (relaxation - 1.0) * (S - Z)
             mean = X.mean(axis=0)
             Z, _ = singular_value_threshold(X - mean, self.weights / self.penalty)
             Z += mean
@@ -246,7 +246,7 @@ class DepthProblem:
             target = self._along_axis((Z - Y).reshape(self.frames, 3, -1))
             if self.motion_weight > 0.0:
                 right = self.penalty * target - self.motion_weight * self._planar_motion
-                target = cho_solve_banded((factor, False), right, check_finite=False)
+                target, _ = dpttrs(*factor, right)
             previous, S = S, self._with_depths(target)
             size = max(float(np.linalg.norm(S)), np.finfo(float).tiny)
             primal = float(np.linalg.norm(S - Z)) / size
@@ -262,7 +262,7 @@ class DepthProblem:
                     change = 1.0
                 self.penalty *= change
                 Y = Y / change
-                factor = self._banded_factor(self.penalty, self.motion_weight)
+                factor = self._tridiagonal_factor(self.penalty, self.motion_weight)
         self.shapes, self.dual = S, Y
         return self.residuals[-1] < tolerance
 
