@@ -16,17 +16,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
 
+from smsr.adjustment import SETTLED
 from smsr.progress import ignore
 from smsr.rotations import depths_along
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from smsr.adjustment import Adjustment
     from smsr.lengths import Evidence, Lengths
     from smsr.progress import StageHook
 
@@ -36,9 +39,10 @@ _FEWEST_ROUNDS = 9  # without lengths
 _FEWEST_MORE = 3  # with them
 _ROUNDS_WITHOUT_LENGTHS = 0.6  # of all, at most
 _FARTHEST = 8.0  # steps that an extrapolation goes at once
+_ROUNDS_WITHOUT_TURNS = 5  # until the model has left the shapes that it was learnt from first
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Deformation:
     """A Gaussian autoregressive process of shapes.
 
@@ -56,8 +60,9 @@ class Deformation:
     covariance: NDArray[np.float64]
     correlation: float
 
+    @cached_property
     def precision(self) -> NDArray[np.float64]:
-        """Return the inverse of the covariance."""
+        """The inverse of the covariance."""
         return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
 
@@ -87,7 +92,7 @@ class LikelyShapes:
     Attributes
     ----------
     shapes : ndarray of shape (T, 3, q)
-        S, with W = R S as before.
+        S, with W = R S as before, R after the adjustment.
     deformation : Deformation
         The model that they were found by.
     iterations : int
@@ -113,6 +118,7 @@ def likely_shapes(
     max_iterations: int,
     tolerance: float,
     lengths: Lengths | None = None,
+    adjustment: Adjustment | None = None,
     hook: StageHook = ignore,
 ) -> LikelyShapes:
     """Move the depths of shapes to where the tracks are likelier, and lengths keep.
@@ -136,13 +142,15 @@ def likely_shapes(
     lengths : Lengths, optional
         Distances between points, some of which keep. They take part once the depths have settled
         without them, and from three fifths of the rounds on anyway.
+    adjustment : Adjustment, optional
+        Of the same cameras, which then go to where the tracks are likelier, too.
     hook : callable
         See `smsr.progress.StageHook`.
     """
     frames, _, points = shapes.shape
-    axis = np.ascontiguousarray(rotations[:, 2])
+    seen = rotations[:, :2] @ shapes
+    axis, planar = _as_seen(rotations, seen)
     depths = depths_along(axis, shapes)
-    planar = shapes - axis[:, :, None] * depths[:, None]
     flat = shapes.reshape(frames, -1)
     size = float(np.linalg.norm(flat - flat.mean(axis=0)))
     variance = floor**2 * float((shapes**2).sum()) / (3 * frames)
@@ -163,8 +171,13 @@ def likely_shapes(
         change = float(np.linalg.norm(posterior.depths - latest[-1])) / size
         latest.append(posterior.depths)
         hook(iteration / max_iterations, iteration, change)
+        turned = 0.0
+        if adjustment is not None and _ROUNDS_WITHOUT_TURNS < iteration <= joins:
+            turned = adjustment.step(turning_force(deformation, seen, rotations, posterior))
+            rotations = adjustment.rotations()
+            axis, planar = _as_seen(rotations, seen)
         # The first steps are as small as the least variance is, whatever is still to come.
-        settled = iteration >= fewest and change < tolerance
+        settled = iteration >= fewest and change < tolerance and turned <= SETTLED
         if iteration == max_iterations or (settled and complete):
             break
         if not complete and (settled or iteration == joins):
@@ -176,6 +189,13 @@ def likely_shapes(
         deformation = _learn(deformation, shapes, axis, posterior, variance)
     shapes = planar + axis[:, :, None] * latest[-1][:, None]
     return LikelyShapes(shapes, deformation, iteration, change, support)
+
+
+def _as_seen(
+    rotations: NDArray[np.float64], seen: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return viewing directions (T, 3) and the shapes of zero depth (T, 3, q)."""
+    return np.ascontiguousarray(rotations[:, 2]), rotations[:, :2].transpose(0, 2, 1) @ seen
 
 
 def extrapolated(
@@ -206,8 +226,8 @@ def condition(
 ) -> Posterior:
     """Return the depths given all that the cameras see.
 
-    The precision of the depths of all frames is block-tridiagonal; it is factored from the first
-    frame to the last, and mean and covariances follow on the way back (Rauch, Tung, Striebel 1965).
+    The precision of the depths of all frames is block-tridiagonal; it is factored from both ends to
+    the middle, and mean and covariances follow on the way back (Rauch, Tung, Striebel 1965).
 
     Parameters
     ----------
@@ -222,41 +242,143 @@ def condition(
     """
     frames, _, points = planar.shape
     here, ahead = _temporal_precision(frames, deformation.correlation)
-    precision = deformation.precision()
+    precision = deformation.precision
     blocks = _by_axes(precision, points)
     diagonal = (_outer(axis, axis) * here[:, None] @ blocks).reshape(frames, points, points)
     coupling = (ahead * _outer(axis[:-1], axis[1:]) @ blocks).reshape(-1, points, points)
     pull = (planar.reshape(frames, -1) - deformation.mean) @ precision
-    force = here[:, None] * pull
-    force[:-1] += ahead * pull[1:]
-    force[1:] += ahead * pull[:-1]
-    force = -depths_along(axis, force.reshape(frames, 3, points))
+    pull = _through_time(pull, here, ahead).reshape(frames, 3, points)
+    force = -depths_along(axis, pull)
     if evidence is not None:
         diagonal += evidence.precision
         force += evidence.force
 
-    inverses = np.empty_like(diagonal)
-    gains = np.empty_like(coupling)
+    return _posterior(diagonal, coupling, force)
+
+
+def _posterior(
+    diagonal: NDArray[np.float64], coupling: NDArray[np.float64], force: NDArray[np.float64]
+) -> Posterior:
+    """Return mean and covariances of a chain from its precision and precision times mean.
+
+    Both ends are eliminated at once, towards the middle: frame i with its mirror image, two
+    matrices to a product, which costs little more than one.
+
+    Parameters
+    ----------
+    diagonal : ndarray of shape (T, q, q)
+        Precision of each frame, T >= 2.
+    coupling : ndarray of shape (T - 1, q, q)
+        Of each frame with the next.
+    force : ndarray of shape (T, q)
+        Precision times mean.
+    """
+    frames, points = force.shape
+    pairs, below = (frames - 1) // 2, np.tri(points, dtype=bool)
+    own = np.stack([diagonal[: pairs + 1], diagonal[::-1][: pairs + 1]], axis=1)
+    inwards = np.stack([coupling[:pairs], coupling[::-1][:pairs].transpose(0, 2, 1)], axis=1)
+    rights = np.stack([force[: pairs + 1], force[::-1][: pairs + 1]], axis=1)[..., None]
+    inverses, gains = np.empty_like(inwards), np.empty_like(inwards)
+    means = np.empty_like(rights)
+    block, right = own[0], rights[0]
+    for i in range(pairs):
+        inverses[i, 0] = _inverse(block[0], below)
+        inverses[i, 1] = _inverse(block[1], below)
+        mean = np.matmul(inverses[i], right, out=means[i])
+        gain = np.matmul(inverses[i], inwards[i], out=gains[i])
+        back = inwards[i].transpose(0, 2, 1)
+        block = own[i + 1] - back @ gain
+        right = rights[i + 1] - back @ mean
+
     depths = np.empty_like(force)
-    below = np.tri(points, dtype=bool)
-    block, right = diagonal[0], force[0]
-    for t in range(frames):
-        inverses[t] = inverse = _inverse(block, below)
-        depths[t] = depth = inverse @ right
-        if t < frames - 1:
-            gain = np.matmul(inverse, coupling[t], out=gains[t])
-            back = coupling[t].T
-            block = diagonal[t + 1] - back @ gain
-            right = force[t + 1] - back @ depth
-    covariances = inverses
-    next_covariances = np.empty_like(coupling)
-    for t in range(frames - 2, -1, -1):
-        gain = gains[t]
-        depths[t] -= gain @ depths[t + 1]
-        following = np.matmul(gain, covariances[t + 1], out=next_covariances[t])
-        covariances[t] += following @ gain.T
-    np.negative(next_covariances, out=next_covariances)
-    return Posterior(depths, covariances, next_covariances)
+    covariances = np.empty_like(diagonal)
+    following = np.empty_like(coupling)
+    last = frames - 1 - pairs
+    if last == pairs:
+        covariances[last] = _inverse(block[0] + block[1] - diagonal[last], below)
+        depths[last] = covariances[last] @ (right[0] + right[1] - force[last][:, None])[:, 0]
+    else:
+        inverse = _inverse(block[0], below)
+        mean, gain = inverse @ right[0], inverse @ coupling[pairs]
+        covariances[last] = _inverse(block[1] - coupling[pairs].T @ gain, below)
+        depths[last] = covariances[last] @ (right[1] - coupling[pairs].T @ mean)[:, 0]
+        depths[pairs] = mean[:, 0] - gain @ depths[last]
+        following[pairs] = -gain @ covariances[last]
+        covariances[pairs] = inverse - following[pairs] @ gain.T
+    middle = [pairs, last]
+    mean, covariance = depths[middle][..., None], covariances[middle]
+    for i in range(pairs - 1, -1, -1):
+        gain = gains[i]
+        mean = np.subtract(means[i], gain @ mean, out=means[i])
+        joint = np.matmul(gain, covariance, out=inwards[i])
+        inverses[i] += joint @ gain.transpose(0, 2, 1)
+        covariance = inverses[i]
+    depths[:pairs], depths[::-1][:pairs] = means[:pairs, 0, :, 0], means[:pairs, 1, :, 0]
+    covariances[:pairs], covariances[::-1][:pairs] = inverses[:, 0], inverses[:, 1]
+    following[:pairs] = -inwards[:, 0]
+    following[::-1][:pairs] = -inwards[:, 1].transpose(0, 2, 1)
+    return Posterior(depths, covariances, following)
+
+
+def turning_force(
+    deformation: Deformation,
+    seen: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    posterior: Posterior,
+) -> NDArray[np.float64]:
+    """Return the gradient of the log-likelihood of the tracks by turns of the cameras.
+
+    By Fisher's identity it is the mean, over the depths given the tracks, of the gradient of the
+    log-density of the shapes, ``sum_n y_tn x h_tn`` with y = R S the shape and h that gradient by
+    the shape, negated, both in the frame of the camera.
+
+    Parameters
+    ----------
+    deformation : Deformation
+        The model.
+    seen : ndarray of shape (T, 2, q)
+        W.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    posterior : Posterior
+        Of the depths, see `condition`.
+
+    Returns
+    -------
+    ndarray of shape (T, 3)
+        By phi_t in ``G_t <- exp(phi_t) G_t``.
+    """
+    frames, _, points = seen.shape
+    axis, planar = _as_seen(rotations, seen)
+    here, ahead = _temporal_precision(frames, deformation.correlation)
+    precision = deformation.precision
+    shapes = planar + axis[:, :, None] * posterior.depths[:, None]
+    pull = _through_time(
+        (shapes.reshape(frames, -1) - deformation.mean) @ precision, here, ahead
+    ).reshape(frames, 3, points)
+    in_camera = np.concatenate([seen, posterior.depths[:, None]], axis=1)
+    force: NDArray[np.float64] = np.cross(in_camera, rotations @ pull, axis=1).sum(axis=2)
+    # The depths and the pull on them vary together.
+    blocks = _by_axes(precision, points).T
+    same = (posterior.covariances.reshape(frames, -1) @ blocks).reshape(-1, 3, 3)
+    following = (posterior.next_covariances.reshape(frames - 1, -1) @ blocks).reshape(-1, 3, 3)
+    joint = here[:, None] * np.einsum("tij,tj->ti", same, axis)
+    joint[:-1] += ahead * np.einsum("tij,tj->ti", following, axis[1:])
+    joint[1:] += ahead * np.einsum("tji,tj->ti", following, axis[:-1])
+    joint = np.einsum("tij,tj->ti", rotations, joint)
+    force[:, 0] -= joint[:, 1]
+    force[:, 1] += joint[:, 0]
+    return force
+
+
+def _through_time(
+    rows: NDArray[np.float64], here: NDArray[np.float64], ahead: float
+) -> NDArray[np.float64]:
+    """Multiply rows (T, n) by the tridiagonal matrix of `_temporal_precision`."""
+    product = here[:, None] * rows
+    product[:-1] += ahead * rows[1:]
+    product[1:] += ahead * rows[:-1]
+    return product
 
 
 def _inverse(matrix: NDArray[np.float64], below: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -302,7 +424,7 @@ def _learn(
     following += _spread(axis[:-1], axis[1:], posterior.next_covariances)
     correlation = deformation.correlation
     if not keep_correlation:
-        precision = deformation.precision()
+        precision = deformation.precision
         ratio = float((precision * following).sum() / (precision * same).sum())
         correlation = min(max(ratio, 0.0), _MOST_CORRELATION)
     scale = 1.0 / (1.0 - correlation**2)

@@ -196,11 +196,14 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             coherent=estimate.coherent,
             simpler=estimate.simpler,
             simpler_share=estimate.simpler_share,
+            adjustable=estimate.adjustable,
             noise=noise,
             points=real,
             hook=hook,
         )
         clock.note(found)
+        if found.rotations is not None:
+            rotations = found.rotations
     cameras = np.ascontiguousarray(rotations[:, :2])
     if points.noise > 0.0:
         lifting = denoised_lifting(found.shapes * unit, points.coordinates)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 
+from smsr.adjustment import Adjustment
 from smsr.deformation import likely_shapes
 from smsr.lengths import Lengths, chosen_points
 from smsr.progress import ignore, part_of
@@ -49,6 +50,8 @@ class ShapeEstimate:
         See `DepthProblem.complexity`; 0 where it was not measured.
     flicker : float
         See `flicker`; 0 where it was not measured.
+    rotations : ndarray of shape (T, 3, 3), optional
+        The cameras, where they were adjusted with the shapes.
     """
 
     shapes: NDArray[np.float64]
@@ -58,6 +61,7 @@ class ShapeEstimate:
     residuals: tuple[float, ...] = ()
     complexity: float = 0.0
     flicker: float = 0.0
+    rotations: NDArray[np.float64] | None = None
 
 
 def planar_shapes(
@@ -276,6 +280,7 @@ def estimate_shapes(
     coherent: bool = False,
     simpler: NDArray[np.float64] | None = None,
     simpler_share: float = 0.0,
+    adjustable: NDArray[np.float64] | None = None,
     noise: float = 0.0,
     points: NDArray[np.float64] | None = None,
     hook: StageHook = ignore,
@@ -296,6 +301,7 @@ def estimate_shapes(
         See `reweighted_shapes`.
     simpler : ndarray of shape (T, 3, 3), optional
     simpler_share : float
+    adjustable : ndarray of shape (k, T, 3), optional
         See `smsr.cameras.CameraEstimate`.
     noise : float
         Standard deviation of the noise that was taken off, as a part of the tracks' spread.
@@ -341,7 +347,11 @@ def estimate_shapes(
         return reweighted_shapes(measurements, rotations, **limits)
 
     def solve(
-        cameras: NDArray[np.float64], weight: float = 1.0, *, deep: bool = False
+        cameras: NDArray[np.float64],
+        weight: float = 1.0,
+        *,
+        deep: bool = False,
+        adjustable: NDArray[np.float64] | None = None,
     ) -> ShapeEstimate:
         if weight < _LITTLE:
             return reweighted_shapes(measurements, cameras, deep=deep, **limits)
@@ -354,15 +364,16 @@ def estimate_shapes(
             cameras,
             noise,
             points=points,
+            adjustable=adjustable,
             max_iterations=options.shape_iterations,
             hook=second,
         )
 
-    if simpler is None or share == 0.0:
-        found = solve(rotations)
-    else:
-        found, other = solve(rotations, 1.0 - share), solve(simpler, share)
-        found = with_mean_depth(found, rotations, other, simpler, share)
+    found = solve(rotations, 1.0 - share, adjustable=adjustable)
+    if found.rotations is not None:
+        rotations = found.rotations
+    if simpler is not None and share > 0.0:
+        found = with_mean_depth(found, rotations, solve(simpler, share), simpler, share)
     found = credible_depth(found, rotations)
     if found.complexity < DOUBTFUL or _trust(noise) == 0.0:
         return found
@@ -656,6 +667,7 @@ def with_likely_depth(
     noise: float = 0.0,
     *,
     points: NDArray[np.float64] | None = None,
+    adjustable: NDArray[np.float64] | None = None,
     max_iterations: int = 1000,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
@@ -675,6 +687,8 @@ def with_likely_depth(
         Standard deviation of the noise that was taken off, as a part of the tracks' spread.
     points : ndarray of shape (q, n), optional
         Some real points in terms of the q that the shapes have; without it, these are real.
+    adjustable : ndarray of shape (k, T, 3), optional
+        What may change of the cameras, see `smsr.adjustment`. They do as far as the depths count.
     max_iterations : int
         Of all, those that the estimate took included.
     hook : callable
@@ -705,23 +719,35 @@ def with_likely_depth(
         noise=noise,
         weight=1.0 + estimate.flicker,
     )
+    adjustment = None if adjustable is None else Adjustment(rotations, adjustable)
     likely = likely_shapes(
         some,
         rotations,
         lengths=lengths,
+        adjustment=adjustment,
         floor=_LIKELY_FLOOR + _FLOOR_BY_NOISE * noise,
         max_iterations=rounds,
         tolerance=_LIKELY_TOLERANCE,
         hook=hook,
     )
     part *= 1.0 - (1.0 - likely.support) * estimate.flicker / _MOST_BY_HASTE
-    shapes = estimate.shapes + part * (likely.shapes - some) @ directions.T
+    reason = (
+        f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them, "
+        f"{likely.support:.0%} of points with lengths that keep"
+    )
+    shapes, others, adjusted = estimate.shapes, likely.shapes, None
+    if adjustment is not None:
+        adjusted = adjustment.rotations(part)
+        shapes, some = (turned_to(each, rotations, adjusted) for each in (shapes, some))
+        others = turned_to(others, adjustment.rotations(), adjusted)
+        degrees = math.degrees(part * float(np.linalg.norm(adjustment.change)))
+        reason += f"; the camera's turn changed by {degrees:.1f} degrees over the sequence"
     return dataclasses.replace(
         estimate,
-        shapes=shapes,
+        shapes=shapes + part * (others - some) @ directions.T,
+        rotations=adjusted,
         iterations=estimate.iterations + likely.iterations,
-        reason=f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them, "
-        f"{likely.support:.0%} of points with lengths that keep",
+        reason=reason,
     )
 
 

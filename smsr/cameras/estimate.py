@@ -46,6 +46,9 @@ class CameraEstimate:
         the object, so its shapes are simpler to them.
     simpler_share : float
         How much of the depths that they see is to be taken, 0 to 1.
+    adjustable : ndarray of shape (k, T, 3), optional
+        What of a path is not sure: rotation vectors in the frame of each camera, by which a change
+        of one radian over the whole sequence turns it. The middle camera stays.
     """
 
     rotations: NDArray[np.float64]
@@ -59,6 +62,7 @@ class CameraEstimate:
     coherent: bool = False
     simpler: NDArray[np.float64] | None = None
     simpler_share: float = 0.0
+    adjustable: NDArray[np.float64] | None = None
 
 
 def scaled_motion(

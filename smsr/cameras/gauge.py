@@ -35,10 +35,15 @@ def fix_gauge(estimate: CameraEstimate) -> CameraEstimate:
     middle = estimate.rotations[len(estimate.rotations) // 2]
     rotations = estimate.rotations @ middle.T
     simpler = None if estimate.simpler is None else estimate.simpler @ middle.T
+    adjustable = estimate.adjustable
     if _turns_negatively(rotations):
         rotations = so3.mirror(rotations)
         simpler = None if simpler is None else so3.mirror(simpler)
-    return dataclasses.replace(estimate, rotations=rotations, simpler=simpler)
+        # exp(v) in the mirror is exp(-D v), D = diag(1, 1, -1)
+        adjustable = None if adjustable is None else adjustable * [-1.0, -1.0, 1.0]
+    return dataclasses.replace(
+        estimate, rotations=rotations, simpler=simpler, adjustable=adjustable
+    )
 
 
 def _turns_negatively(fixed: NDArray[np.float64]) -> bool:

@@ -255,6 +255,7 @@ def _on_path(
         coherent=not path.is_loose and (verdict.motion_rise or 0.0) <= COHERENT_RISE,
         simpler=free.rotations,
         simpler_share=max(share, least),
+        adjustable=None if path.is_loose else turn.by_velocity(),
         reason=f"{path}, {speed:.2f} degrees a frame, {verdict.reason}; {free.reason}",
     )
 

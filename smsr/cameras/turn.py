@@ -53,6 +53,22 @@ class Turn:
         turned: NDArray[np.float64] = so3.exp(self.angles[:, None] * self.velocity) @ self.start
         return turned
 
+    def by_velocity(self) -> NDArray[np.float64]:
+        """Return how the cameras change with the velocity, about that of the middle frame.
+
+        Returns
+        -------
+        ndarray of shape (3, T, 3)
+            For each axis of the camera frame the rotation vectors, in the frames of the cameras,
+            where the velocity changes by one radian over the whole turn.
+        """
+        middle = self.angles[len(self.angles) // 2]
+        gone = self.angles - middle
+        parts = gone / max(float(np.ptp(gone)), np.finfo(float).tiny)
+        fields = so3.left_jacobian(gone[:, None] * self.velocity) * parts[:, None, None]
+        seen: NDArray[np.float64] = (so3.exp(self.shake) @ fields).transpose(2, 0, 1)
+        return seen
+
     def every(self, step: int) -> Turn:
         """Return the turn of every n-th frame."""
         return dataclasses.replace(self, angles=self.angles[::step], shake=self.shake[::step])
@@ -160,6 +176,6 @@ def refine_velocity(
         np.zeros(3),
         jac=True,
         method="L-BFGS-B",
-        options={"maxiter": evaluations, "maxfun": evaluations},
+        options={"maxiter": evaluations, "maxfun": evaluations, "ftol": 1e-5},  # of the energy
     )
     return at(found.x)

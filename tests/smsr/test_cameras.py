@@ -300,6 +300,20 @@ class TestTurn:
         assert np.linalg.norm(rest - drift) < 0.4 * np.linalg.norm(drift)
         np.testing.assert_allclose(found.every(3).rotations, found.rotations[::3], atol=1e-12)
 
+    def test_fields_of_the_velocity_are_its_derivative_about_the_middle(self) -> None:
+        turn = fit_uniform_turn(orbit(60))
+        shake = np.radians(1.0) * np.random.default_rng(0).standard_normal((60, 3))
+        turn = dataclasses.replace(turn, angles=2.0 * turn.angles + 7.0, shake=shake)
+        fields = turn.by_velocity()
+        assert not fields[:, 30].any()
+        change = 1e-6 * np.array([0.4, -0.7, 0.2])
+        span = turn.angles[-1] - turn.angles[0]
+        other = dataclasses.replace(turn, velocity=turn.velocity + change / span).rotations
+        # The same object frame: that in which the middle camera is the identity.
+        aligned = other @ other[30].T @ turn.rotations[30]
+        moved = so3.log(aligned @ turn.rotations.transpose(0, 2, 1))
+        np.testing.assert_allclose(moved, np.tensordot(change, fields, axes=1), atol=1e-11)
+
     def test_refinement_brings_the_velocity_nearer(self) -> None:
         true = orbit(60)
         left, values = low_rank(true, modes=2)
@@ -552,6 +566,8 @@ class TestSelection:
         (unexplained,) = (n for name, n in estimate.criteria.items() if "unexplained" in name)
         assert unexplained < 0.1
         assert camera_error(estimate.rotations, true) < 0.06
+        loose = model in {"gimbal", "axis"}
+        assert (estimate.adjustable is None) == loose
 
     @pytest.mark.parametrize("amplitude", [0.1, 0.3])
     @pytest.mark.parametrize("seed", [0, 1])
@@ -622,6 +638,19 @@ class TestGauge:
             relative = fixed.rotations.transpose(0, 2, 1) @ fixed.simpler
             angles = so3.angles_between(relative, np.broadcast_to(np.eye(3), (21, 3, 3)))
             np.testing.assert_allclose(angles, 0.2 * np.sqrt(3.0), atol=1e-12)
+
+    def test_cameras_can_be_adjusted_before_or_after(self) -> None:
+        turn = fit_uniform_turn(orbit(21))
+        turns = np.tensordot([0.1, 0.05, -0.2], turn.by_velocity(), axes=1)
+        adjusted = self.fixed(so3.exp(turns) @ turn.rotations)
+        for mirrored in (False, True):
+            fields, G = turn.by_velocity(), turn.rotations
+            if mirrored:
+                fields, G = fields * [-1.0, -1.0, 1.0], so3.mirror(G)
+            fixed = fix_gauge(CameraEstimate(G, "uniform", 1, 1, True, "", adjustable=fields))
+            assert fixed.adjustable is not None
+            turns = np.tensordot([0.1, 0.05, -0.2], fixed.adjustable, axes=1)
+            np.testing.assert_allclose(so3.exp(turns) @ fixed.rotations, adjusted, atol=1e-12)
 
     def test_still_camera(self) -> None:
         still = np.broadcast_to(np.eye(3), (5, 3, 3))

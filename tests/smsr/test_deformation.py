@@ -1,12 +1,21 @@
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from smsr.deformation import Deformation, condition, extrapolated, likely_shapes
+from smsr import rotations as so3
+from smsr.adjustment import Adjustment
+from smsr.deformation import (
+    Deformation,
+    condition,
+    extrapolated,
+    likely_shapes,
+    turning_force,
+)
 from smsr.lengths import Evidence, Lengths
 from smsr.shapes import low_rank_shapes
 from tests.limbs import turning
@@ -69,9 +78,13 @@ def log_likelihood(deformation: Deformation, shapes: Array, rotations: Array) ->
 
 
 class TestCondition:
-    @pytest.mark.parametrize("correlation", [0.0, 0.6, 0.98])
-    def test_it_is_the_conditional_of_the_joint_gaussian(self, correlation: float) -> None:
-        frames, points = 5, 3
+    @pytest.mark.parametrize(
+        ("frames", "correlation"), [(2, 0.6), (3, 0.6), (4, 0.6), (5, 0.0), (5, 0.98), (8, 0.9)]
+    )
+    def test_it_is_the_conditional_of_the_joint_gaussian(
+        self, frames: int, correlation: float
+    ) -> None:
+        points = 3
         deformation = model(points, correlation)
         shapes, rotations = sample(deformation, frames), turning(frames, 20.0)
         joint = np.kron(temporal_covariance(frames, correlation), deformation.covariance)
@@ -128,6 +141,28 @@ class TestCondition:
         assert np.linalg.eigvalsh(found.covariances[-1]).min() > 0.0
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_turning_force_is_the_gradient_of_the_likelihood(correlation: float) -> None:
+    deformation, rotations = model(3, correlation), turning(5, 20.0)
+    shapes = sample(deformation, 5)
+    seen = rotations[:, :2] @ shapes
+    posterior = condition(deformation, without_depth(shapes, rotations), rotations[:, 2])
+    force = turning_force(deformation, seen, rotations, posterior)
+    expected = np.zeros_like(force)
+    step = 1e-5
+    for t, axis in np.ndindex(5, 3):
+        turn = np.zeros((5, 3))
+        turn[t, axis] = step
+        there, back = (so3.exp(sign * turn) @ rotations for sign in (1.0, -1.0))
+        # What the cameras see stays: they see it of other shapes.
+        values = [
+            log_likelihood(deformation, R.transpose(0, 2, 1) @ (rotations @ shapes), R)
+            for R in (there, back)
+        ]
+        expected[t, axis] = (values[0] - values[1]) / (2.0 * step)
+    np.testing.assert_allclose(force, expected, atol=1e-6 * np.abs(expected).max())
+
+
 class Spy(Lengths):
     """Lengths that say nothing, and how often they were asked."""
 
@@ -154,6 +189,49 @@ def test_lengths_join_when_depths_have_settled(
     )
     assert (found.iterations, spy.asked) == (taken, with_lengths)
     assert found.support == (0.25 if with_lengths else 0.0)
+
+
+class TestAdjustment:
+    def test_a_turn_that_is_a_little_too_fast_is_slowed_down(self) -> None:
+        true = sample(model(10, 0.9, rank=4), 150)
+        rotations = turning(150, 3.0)
+        # By three degrees over the sequence, about the middle frame.
+        parts = (np.arange(150) - 75) / 149
+        fields = (parts[:, None] * np.array([0.1, 1.0, 0.2]))[None]
+        wrong = so3.exp(math.radians(3.0) * fields[0]) @ rotations
+        start = wrong.transpose(0, 2, 1) @ (rotations @ true)
+        adjustment = Adjustment(wrong, fields)
+        found = likely_shapes(
+            start, wrong, floor=0.001, max_iterations=40, tolerance=0.0, adjustment=adjustment
+        )
+        assert math.degrees(adjustment.change[0]) == pytest.approx(-3.0, abs=0.5)
+        cameras = adjustment.rotations()
+        np.testing.assert_allclose(cameras[75], rotations[75], atol=1e-12)
+        np.testing.assert_allclose(
+            cameras[:, :2] @ found.shapes, rotations[:, :2] @ true, atol=1e-9
+        )
+
+    def test_it_rests_once_lengths_have_joined(self) -> None:
+        true, rotations = sample(model(6, 0.9, rank=3), 30), turning(30, 6.0)
+        spy, steps = Spy(), []
+
+        class Counted(Adjustment):
+            def step(self, force: Array) -> float:
+                steps.append(spy.asked)
+                return super().step(force)
+
+        adjustment = Counted(rotations, np.ones((1, 30, 3)))
+        likely_shapes(
+            true,
+            rotations,
+            floor=0.01,
+            max_iterations=20,
+            tolerance=0.0,
+            lengths=spy,
+            adjustment=adjustment,
+        )
+        assert steps == [0] * 7  # of rounds 6 to 12
+        assert spy.asked == 8
 
 
 class TestLikelyShapes:

@@ -386,6 +386,72 @@ class TestLikelyDepth:
         assert with_likely_depth(found, rotations) is found
 
 
+class TestAdjustedCameras:
+    """A turn that is two degrees too fast over the sequence, about the middle frame."""
+
+    true, rotations = limbs(120), turning(120, 4.0)
+    fields = ((np.arange(120) - 60) / 119)[None, :, None] * np.array([0.1, 1.0, 0.2])
+    wrong = so3.exp(np.radians(2.0) * fields[0]) @ rotations
+    W = (rotations[:, :2] @ true).reshape(240, -1)
+
+    def error(self, cameras: Array) -> float:
+        return float(np.degrees(so3.angles_between(cameras, self.rotations).max()))
+
+    def test_they_come_nearer_and_see_the_tracks(self) -> None:
+        found = reweighted_shapes(self.W, self.wrong)
+        plain = with_likely_depth(found, self.wrong)
+        assert plain.rotations is None
+        likely = with_likely_depth(found, self.wrong, adjustable=self.fields)
+        assert likely.rotations is not None
+        assert self.error(likely.rotations) < 0.6 * self.error(self.wrong)
+        seen = (likely.rotations[:, :2] @ likely.shapes).reshape(self.W.shape)
+        np.testing.assert_allclose(seen, self.W, atol=1e-9)
+        assert relative_error(likely.shapes, self.true) < relative_error(plain.shapes, self.true)
+        assert "turn changed by" in likely.reason
+
+    def test_as_far_as_the_depths_count(self) -> None:
+        found = reweighted_shapes(self.W, self.wrong)
+        whole, half, none = (
+            with_likely_depth(
+                dataclasses.replace(found, complexity=value), self.wrong, adjustable=self.fields
+            ).rotations
+            for value in (0.5, 0.65, 0.75)
+        )
+        assert whole is not None
+        assert half is not None
+        assert none is None
+        turns = so3.log(whole @ self.wrong.transpose(0, 2, 1))
+        np.testing.assert_allclose(half, so3.exp(0.5 * turns) @ self.wrong, atol=1e-12)
+
+    def test_virtual_points_give_the_same(self) -> None:
+        U, values, right = np.linalg.svd(self.W / np.linalg.norm(self.W, 2), full_matrices=False)
+        kept = values > 1e-12
+        virtual, mixing = U[:, kept] * values[kept], right[kept]
+        all_points, reduced = (
+            estimate_shapes(W, self.wrong, Options(), adjustable=self.fields, points=points)
+            for W, points in ((virtual @ mixing, None), (virtual, mixing))
+        )
+        assert all_points.rotations is not None
+        assert reduced.rotations is not None
+        np.testing.assert_allclose(reduced.rotations, all_points.rotations, atol=1e-8)
+        np.testing.assert_allclose(reduced.shapes @ mixing, all_points.shapes, atol=1e-8)
+
+    @pytest.mark.parametrize("share", [0.0, 0.5])
+    def test_what_other_cameras_see_is_turned_to_them(self, share: float) -> None:
+        found = estimate_shapes(
+            self.W,
+            self.wrong,
+            Options(),
+            adjustable=self.fields,
+            simpler=self.wrong,
+            simpler_share=share,
+        )
+        assert found.rotations is not None
+        assert self.error(found.rotations) < 0.6 * self.error(self.wrong)
+        seen = (found.rotations[:, :2] @ found.shapes).reshape(self.W.shape)
+        np.testing.assert_allclose(seen, self.W, atol=1e-9)
+
+
 class TestTwoSolutions:
     def estimates(self, complexity: float) -> tuple[Array, Array, ShapeEstimate, ShapeEstimate]:
         """Return W, cameras, a solution and one with half of its depth and a complexity."""
