@@ -22,7 +22,9 @@ SETTLED = math.radians(0.1)
 """A step that is no longer than this is none."""
 
 _SPREAD = math.radians(1.0)  # standard deviation of a change, before anything is known
-_CURVATURE = (0.1, 0.01, 2.0)  # of the log-likelihood of a frame, per degree^2: first, least, most
+_CURVATURE = 0.1  # of the log-likelihood of a frame at first, per degree^2
+_LEAST_CURVATURE, _MOST_CURVATURE = 0.01, 100.0
+_TELLING = math.radians(0.02)  # a step that is shorter says nothing of the curvature
 _LONGEST_STEP = math.radians(1.0)
 _FARTHEST = math.radians(6.0)
 
@@ -31,22 +33,23 @@ class Adjustment:
     """How far cameras went along each of some fields, and the next step.
 
     Steps go up the gradient of the log-likelihood, less that of a normal prior, with the curvature
-    that the last step showed (Barzilai, Borwein 1988). That of a Gaussian model learnt from the
-    same depths is the gradient of the likelihood as learnt, too.
+    that the last step showed (Barzilai, Borwein 1988). That the model is learnt anew between steps
+    does not count, to first order, as long as it is near the likeliest.
 
     Parameters
     ----------
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     fields : ndarray of shape (k, T, 3)
-        Rotation vectors, in the camera frame, by which a change of one radian turns the cameras.
+        Rotation vectors, in the camera frame, by which a change of one radian turns the cameras;
+        about a radian long where they are longest.
     """
 
     def __init__(self, rotations: NDArray[np.float64], fields: NDArray[np.float64]) -> None:
         self._start = rotations
         self._fields = fields
         self.change = np.zeros(len(fields))
-        self._curvature = _per_radian(_CURVATURE[0])
+        self._curvature = _per_radian(_CURVATURE)
         self._last: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def rotations(self, part: float = 1.0) -> NDArray[np.float64]:
@@ -67,9 +70,10 @@ class Adjustment:
         gradient = -np.tensordot(self._fields, force, axes=2) / frames
         if self._last is not None:
             moved, bent = self.change - self._last[0], gradient - self._last[1]
-            if (square := float(moved @ moved)) > 0.0:
-                low, high = map(_per_radian, _CURVATURE[1:])
-                self._curvature = min(max(float(moved @ bent) / square, low), high)
+            # Of a short step the gradient tells less than of what was learnt meanwhile.
+            if np.linalg.norm(moved) > _TELLING and (rise := float(moved @ bent)) > 0.0:
+                low, high = _per_radian(_LEAST_CURVATURE), _per_radian(_MOST_CURVATURE)
+                self._curvature = min(max(rise / float(moved @ moved), low), high)
         self._last = self.change, gradient
         prior = 1.0 / (frames * _SPREAD**2)
         step = -(gradient + prior * self.change) / (self._curvature + prior)

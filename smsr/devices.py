@@ -7,6 +7,7 @@ triangles (2T x 2T) and finished shapes come to the host, where the small solver
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -115,9 +116,9 @@ class DeviceSource:
                 sink.write(points, shapes)
 
             # The device is used from this thread alone, as some libraries keep its state by thread.
-            done = map_chunks(store, finished(), workers or blas_threads())
-            for index, (stop, _) in enumerate(done, 1):
-                progress(stop / self.points, index, None)
+            with closing(map_chunks(store, finished(), workers or blas_threads())) as done:
+                for index, (stop, _) in enumerate(done, 1):
+                    progress(stop / self.points, index, None)
         except BaseException:
             sink.discard()
             raise

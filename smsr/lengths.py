@@ -67,7 +67,8 @@ class Lengths:
     directions : ndarray of shape (q, n)
         The points in terms of what the depths are asked for.
     axis : ndarray of shape (T, 3)
-        Viewing directions.
+        Viewing directions. They tell how a pair moves in the object's frame; its lengths do not
+        depend on them, so cameras may turn a little afterwards.
     depths : ndarray of shape (T, q)
         That belong to the shapes. Depth of the points that these do not explain stays.
     noise : float

@@ -121,7 +121,8 @@ class Options:
         "How shapes are found: 'nuclear' minimises the nuclear norm to convergence, 'reweighted' "
         "a reweighted nuclear norm and the motion between frames, 'paper' follows the published "
         "schedule of penalties. 'auto' is 'paper' in that preset; otherwise 'reweighted', refined "
-        "to the likeliest depths of a Gaussian deformation and of lengths that keep, with depth "
+        "to the likeliest depths of a Gaussian deformation and of lengths that keep, and to the "
+        "likeliest velocity of a camera on a simple path, with depth "
         "faded out where the tracks do not bear it out, and one shape for a rigid object.",
     )
     shape_iterations: int = option(

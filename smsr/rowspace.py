@@ -13,6 +13,7 @@ Gram matrix W W^T would be cheaper, and would lose half of the digits of the sma
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -280,9 +281,9 @@ def map_back(
         operator = _operator(A, rowspace, sink.dtype)
         for _ in range(workers):
             spaces.put(Workspace(operator, size, sink.dtype))
-        done = map_chunks(work, checked_chunks(source, size), workers)
-        for index, (stop, _) in enumerate(done, 1):
-            progress(stop / points, index, None)
+        with closing(map_chunks(work, checked_chunks(source, size), workers)) as done:
+            for index, (stop, _) in enumerate(done, 1):
+                progress(stop / points, index, None)
     except BaseException:
         sink.discard()
         raise

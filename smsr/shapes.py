@@ -21,7 +21,7 @@ from smsr.deformation import likely_shapes
 from smsr.lengths import Lengths, chosen_points
 from smsr.progress import ignore, part_of
 from smsr.proximal import singular_value_threshold, singular_values
-from smsr.rotations import depths_along
+from smsr.rotations import angles_between, depths_along
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -102,7 +102,7 @@ class DepthProblem:
     measurements : ndarray of shape (2T, N)
         W, centred.
     rotations : ndarray of shape (T, 3, 3)
-        Cameras completed by the viewing direction.
+        Cameras completed by the viewing direction, T >= 2.
     """
 
     FIRST_PENALTY = 10.0  # relative to 1 / sigma_1(P S#)
@@ -163,7 +163,9 @@ class DepthProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Factor ``penalty I + motion_weight n^T D^T D n``, for `dpttrs`."""
         diagonal = penalty + motion_weight * self._diagonal
-        factor = dpttrf(diagonal, motion_weight * self._off_diagonal)
+        *factor, failed = dpttrf(diagonal, motion_weight * self._off_diagonal)
+        if failed:
+            raise np.linalg.LinAlgError("The motion of the depths is not positive definite.")
         return factor[0], factor[1]
 
     def start_from_least_motion(self) -> None:
@@ -310,7 +312,7 @@ def estimate_shapes(
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    share = simpler_share * _trust(noise)
+    share = 0.0 if simpler is None else simpler_share * _trust(noise)
     blended = options.shape_method == "auto" and share < 1.0
     if simpler is not None and simpler_share == 1.0 and not blended:
         found = estimate_shapes(
@@ -740,8 +742,8 @@ def with_likely_depth(
         adjusted = adjustment.rotations(part)
         shapes, some = (turned_to(each, rotations, adjusted) for each in (shapes, some))
         others = turned_to(others, adjustment.rotations(), adjusted)
-        degrees = math.degrees(part * float(np.linalg.norm(adjustment.change)))
-        reason += f"; the camera's turn changed by {degrees:.1f} degrees over the sequence"
+        degrees = math.degrees(float(angles_between(adjusted, rotations).max()))
+        reason += f"; cameras adjusted by up to {degrees:.1f} degrees"
     return dataclasses.replace(
         estimate,
         shapes=shapes + part * (others - some) @ directions.T,

@@ -19,7 +19,7 @@ from threadpoolctl import ThreadpoolController
 from smsr.errors import WrongShape
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Generator, Iterable, Iterator
     from contextlib import AbstractContextManager
 
     from numpy.typing import NDArray
@@ -55,13 +55,13 @@ def few_blas_threads(matrix: NDArray[Any]) -> AbstractContextManager[object]:
 
 def map_chunks(
     work: Callable[[slice, NDArray[Any]], Result], chunks: Iterable[Chunk], workers: int
-) -> Iterator[tuple[int, Result]]:
+) -> Generator[tuple[int, Result]]:
     """Apply `work` to each chunk.
 
     Parameters
     ----------
     work : callable
-        Takes the slice of points and the block (2T, n); called from several threads at once.
+        Takes the slice of points and its block; called from several threads at once.
     chunks : iterable
         Read from the calling thread, at most ``workers + 1`` chunks ahead.
     workers : int

@@ -60,7 +60,7 @@ class Turn:
         -------
         ndarray of shape (3, T, 3)
             For each axis of the camera frame the rotation vectors, in the frames of the cameras,
-            where the velocity changes by one radian over the whole turn.
+            where the velocity changes by one radian over the range of the angles.
         """
         middle = self.angles[len(self.angles) // 2]
         gone = self.angles - middle

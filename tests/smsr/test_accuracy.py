@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.data
 
 SPARSE = {
-    "drink": 0.015,
-    "pickup": 0.035,
-    "stretch": 0.040,
-    "yoga": 0.035,
+    "drink": 0.006,
+    "pickup": 0.025,
+    "stretch": 0.033,
+    "yoga": 0.022,
     "dance": 0.0988,
     "dinosaur": 0.235,
 }
-DENSE = {"facecap": 0.025, "samba": 0.14}
+DENSE = {"facecap": 0.015, "samba": 0.10}
 
 
 def sparse_set(folder: Path, name: str) -> tuple[Array, Array]:

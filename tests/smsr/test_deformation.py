@@ -211,27 +211,28 @@ class TestAdjustment:
             cameras[:, :2] @ found.shapes, rotations[:, :2] @ true, atol=1e-9
         )
 
-    def test_it_rests_once_lengths_have_joined(self) -> None:
+    @pytest.mark.parametrize(("length", "steps"), [(1.0, 7), (0.0, 4)])
+    def test_lengths_wait_for_it_and_then_it_rests(self, length: float, steps: int) -> None:
         true, rotations = sample(model(6, 0.9, rank=3), 30), turning(30, 6.0)
-        spy, steps = Spy(), []
+        spy, asked = Spy(), []
 
-        class Counted(Adjustment):
+        class Steady(Adjustment):
             def step(self, force: Array) -> float:
-                steps.append(spy.asked)
-                return super().step(force)
+                asked.append(spy.asked)
+                return length
 
-        adjustment = Counted(rotations, np.ones((1, 30, 3)))
         likely_shapes(
             true,
             rotations,
             floor=0.01,
             max_iterations=20,
-            tolerance=0.0,
+            tolerance=1.0,
             lengths=spy,
-            adjustment=adjustment,
+            adjustment=Steady(rotations, np.ones((1, 30, 3))),
         )
-        assert steps == [0] * 7  # of rounds 6 to 12
-        assert spy.asked == 8
+        # From the sixth round on, to the twelfth of twenty at most, or until all has settled.
+        assert asked == [0] * steps
+        assert spy.asked == 3
 
 
 class TestLikelyShapes:

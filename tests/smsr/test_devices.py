@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -228,9 +229,12 @@ def test_a_stopped_pass_leaves_no_file(place: Place, tmp_path: Path) -> None:
         if done > 0.3:
             raise Cancelled("enough")
 
-    with pytest.raises(Cancelled):
+    threads = threading.active_count()
+    with pytest.raises(Cancelled) as caught:
         map_back(source, space, some_map(), tmp_path, chunk_bytes=SIZE, progress=stop)
     assert not list(tmp_path.iterdir())
+    # Nothing that could write on is left even while the error and its frames are.
+    assert threading.active_count() == threads, caught
 
 
 class TestWithoutTheExtra:

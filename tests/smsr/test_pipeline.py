@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_info
 
 import smsr
 from smsr import Progress, evaluate, reconstruct
+from smsr import rotations as so3
 from smsr.cameras import estimate_cameras, fix_gauge
 from smsr.errors import Cancelled, InvalidOption, UnknownOption
 from smsr.options import Options, resolve
@@ -18,6 +19,7 @@ from smsr.pipeline import STAGES
 from smsr.rotations import complete
 from smsr.shapes import estimate_shapes
 from smsr.synthetic import make_example, make_low_rank
+from tests.limbs import limbs, turning
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -251,6 +253,20 @@ def test_where_points_rest_the_camera_sees_what_the_free_camera_saw(method: str)
     ]
     sign = np.sign((depths[0] * depths[1]).sum())
     np.testing.assert_allclose(depths[0], sign * depths[1], atol=1e-9 * np.abs(W).max())
+
+
+def test_the_velocity_of_a_turn_is_adjusted_with_the_depths() -> None:
+    rotations = turning(120, 4.0)
+    W = (rotations[:, :2] @ limbs(120)).reshape(240, -1)
+    speeds = []
+    for method in ("auto", "reweighted"):
+        result = reconstruct(W, shape_method=method)
+        assert result.diagnostics.camera_model == "uniform"
+        reasons = {stage.name: stage.reason for stage in result.diagnostics.stages}
+        assert ("cameras adjusted" in reasons["shapes"]) == (method == "auto")
+        cameras = complete(result.cameras)
+        speeds.append(so3.angles_between(cameras[1:], cameras[:-1]).mean())
+    assert abs(speeds[0] - speeds[1]) > 1e-7
 
 
 @pytest.mark.parametrize("preset", PRESETS)
