@@ -90,7 +90,7 @@ def test_memory_does_not_grow_with_the_upload_nor_with_the_download(
 
         # The upload is moved to where a result would be: only its bytes matter to a download.
         job_id = answer.json()["id"]
-        frames, points = 60, length // (60 * 12)
+        frames, points = 240, length // (240 * 12)
         folder = api.objects / "results" / job_id / "1"
         folder.mkdir(parents=True)
         shapes = npy_header((frames, points, 3), "<f4")
