@@ -34,6 +34,7 @@ from smsr.noise import virtual_points
 from smsr.options import Options, parse, resolve
 from smsr.progress import Progress
 from smsr.result import Diagnostics, Reconstruction, StageReport
+from smsr.rotations import angles_between
 from smsr.rowspace import factorise, map_back
 from smsr.shapes import basis_size_of, estimate_shapes
 from smsr.streaming import one_blas_thread
@@ -202,7 +203,10 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             hook=hook,
         )
         clock.note(found)
+        reason = estimate.reason
         if found.rotations is not None:
+            degrees = math.degrees(angles_between(found.rotations, rotations).max())
+            reason += f"; adjusted with the depths, by up to {degrees:.1f} degrees"
             rotations = found.rotations
     cameras = np.ascontiguousarray(rotations[:, :2])
     if points.noise > 0.0:
@@ -217,7 +221,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
         lifting=lifting,
         basis_size=estimate.basis_size if published else basis_size_of(found.shapes),
         camera_model=estimate.model,
-        camera_reason=estimate.reason,
+        camera_reason=reason,
         camera_criteria=estimate.criteria,
         noise=points.noise,
         cautions=(

@@ -21,7 +21,7 @@ from smsr.deformation import likely_shapes
 from smsr.lengths import Lengths, chosen_points
 from smsr.progress import ignore, part_of
 from smsr.proximal import singular_value_threshold, singular_values
-from smsr.rotations import angles_between, depths_along
+from smsr.rotations import depths_along
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -733,23 +733,18 @@ def with_likely_depth(
         hook=hook,
     )
     part *= 1.0 - (1.0 - likely.support) * estimate.flicker / _MOST_BY_HASTE
-    reason = (
-        f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them, "
-        f"{likely.support:.0%} of points with lengths that keep"
-    )
     shapes, others, adjusted = estimate.shapes, likely.shapes, None
     if adjustment is not None:
         adjusted = adjustment.rotations(part)
         shapes, some = (turned_to(each, rotations, adjusted) for each in (shapes, some))
         others = turned_to(others, adjustment.rotations(), adjusted)
-        degrees = math.degrees(float(angles_between(adjusted, rotations).max()))
-        reason += f"; cameras adjusted by up to {degrees:.1f} degrees"
     return dataclasses.replace(
         estimate,
         shapes=shapes + part * (others - some) @ directions.T,
         rotations=adjusted,
         iterations=estimate.iterations + likely.iterations,
-        reason=reason,
+        reason=f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them, "
+        f"{likely.support:.0%} of points with lengths that keep",
     )
 
 
