@@ -1,6 +1,6 @@
 """Time the two passes over the points where an array lies on a device, against those of numpy.
 
-    python benchmarks/device.py cupy torch:cuda --frames 51 --points 100000 1000000
+    python -m benchmarks.device cupy torch:cuda --frames 51 --points 100000 1000000
 
 Each name is a library of the array API, after a colon its device. The tracks, float32, lie in the
 memory of the device; the shapes come back to that of the host. Both sides alternate in one run, and
@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import time
+import tempfile
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.floor import make_measurements, timed
 from smsr.measurements import as_source
 from smsr.rowspace import factorise, map_back
 from smsr.streaming import blas_threads
@@ -27,16 +29,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def make_measurements(frames: int, points: int) -> NDArray[np.float32]:
-    """Make tracks of low rank with noise."""
-    rng = np.random.default_rng(0)
-    W = rng.standard_normal((2 * frames, 12), dtype=np.float32) @ rng.standard_normal(
-        (12, points), dtype=np.float32
-    )
-    W += 1e-3 * rng.standard_normal(W.shape, dtype=np.float32)
-    return W + 100 * rng.standard_normal((2 * frames, 1), dtype=np.float32)
-
-
 def put(W: NDArray[np.float32], name: str) -> Any:
     """Copy W to the library and device of a name like torch:cuda."""
     library, _, device = name.partition(":")
@@ -44,14 +36,10 @@ def put(W: NDArray[np.float32], name: str) -> Any:
     return xp.asarray(W, device=device) if device else xp.asarray(W)
 
 
-def timed(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
 def measure(frames: int, points: int, names: list[str], repeats: int) -> None:
-    W = make_measurements(frames, points)
+    with tempfile.TemporaryDirectory() as folder:
+        make_measurements(Path(folder, "W.npy"), frames, points)
+        W = np.load(Path(folder, "W.npy"))
     A = np.random.default_rng(1).standard_normal((3 * frames, 2 * frames))
     sources = {"numpy": as_source(W)} | {name: as_source(put(W, name)) for name in names}
     space = factorise(sources["numpy"])
@@ -61,7 +49,7 @@ def measure(frames: int, points: int, names: list[str], repeats: int) -> None:
         work += [partial(factorise, source), partial(map_back, source, space, A, shapes[name])]
     for each in work:  # the first call loads a device's libraries
         each()
-    seconds = np.median([[timed(each) for each in work] for _ in range(repeats)], axis=0)
+    seconds = np.median([[timed(each)[0] for each in work] for _ in range(repeats)], axis=0)
     expected = shapes["numpy"]
     for name, (factorising, mapping) in zip(sources, seconds.reshape(-1, 2), strict=True):
         total, host = factorising + mapping, float(seconds[:2].sum())

@@ -173,7 +173,7 @@ def likely_shapes(
         hook(iteration / max_iterations, iteration, change)
         turned = 0.0
         if adjustment is not None and _ROUNDS_WITHOUT_TURNS < iteration <= joins:
-            turned = adjustment.step(turning_force(deformation, seen, rotations, posterior))
+            turned = adjustment.step(turning_force(deformation, planar, rotations, posterior))
             rotations = adjustment.rotations()
             axis, planar = _as_seen(rotations, seen)
         # The first steps are as small as the least variance is, whatever is still to come.
@@ -252,7 +252,6 @@ def condition(
     if evidence is not None:
         diagonal += evidence.precision
         force += evidence.force
-
     return _posterior(diagonal, coupling, force)
 
 
@@ -322,7 +321,7 @@ def _posterior(
 
 def turning_force(
     deformation: Deformation,
-    seen: NDArray[np.float64],
+    planar: NDArray[np.float64],
     rotations: NDArray[np.float64],
     posterior: Posterior,
 ) -> NDArray[np.float64]:
@@ -336,8 +335,8 @@ def turning_force(
     ----------
     deformation : Deformation
         The model.
-    seen : ndarray of shape (T, 2, q)
-        W.
+    planar : ndarray of shape (T, 3, q)
+        The shapes of zero depth, R^+ W.
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     posterior : Posterior
@@ -348,16 +347,15 @@ def turning_force(
     ndarray of shape (T, 3)
         By phi_t in ``G_t <- exp(phi_t) G_t``.
     """
-    frames, _, points = seen.shape
-    axis, planar = _as_seen(rotations, seen)
+    frames, _, points = planar.shape
+    axis = rotations[:, 2]
     here, ahead = _temporal_precision(frames, deformation.correlation)
     precision = deformation.precision
     shapes = planar + axis[:, :, None] * posterior.depths[:, None]
     pull = _through_time(
         (shapes.reshape(frames, -1) - deformation.mean) @ precision, here, ahead
     ).reshape(frames, 3, points)
-    in_camera = np.concatenate([seen, posterior.depths[:, None]], axis=1)
-    force: NDArray[np.float64] = np.cross(in_camera, rotations @ pull, axis=1).sum(axis=2)
+    force: NDArray[np.float64] = np.cross(rotations @ shapes, rotations @ pull, axis=1).sum(axis=2)
     # The depths and the pull on them vary together.
     blocks = _by_axes(precision, points).T
     same = (posterior.covariances.reshape(frames, -1) @ blocks).reshape(-1, 3, 3)

@@ -162,11 +162,12 @@ class DepthProblem:
         self, penalty: float, motion_weight: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Factor ``penalty I + motion_weight n^T D^T D n``, for `dpttrs`."""
-        diagonal = penalty + motion_weight * self._diagonal
-        *factor, failed = dpttrf(diagonal, motion_weight * self._off_diagonal)
+        diagonal, off_diagonal, failed = dpttrf(
+            penalty + motion_weight * self._diagonal, motion_weight * self._off_diagonal
+        )
         if failed:
             raise np.linalg.LinAlgError("The motion of the depths is not positive definite.")
-        return factor[0], factor[1]
+        return diagonal, off_diagonal
 
     def start_from_least_motion(self) -> None:
         """Set the depths that move the shape least from frame to frame."""

@@ -246,6 +246,8 @@ def _on_path(
         least = 1.0
     elif path.is_certain:
         least = by_turn_speed(turn.rotations, LEAST_SHARE, 0.0)
+    middle = turn.angles[len(turn.angles) // 2]
+    adjustable = None if path.is_loose else turn.by_velocity(middle) / turn.span
     speed = math.degrees(float(np.linalg.norm(turn.velocity)))
     return dataclasses.replace(
         free,
@@ -255,7 +257,7 @@ def _on_path(
         coherent=not path.is_loose and (verdict.motion_rise or 0.0) <= COHERENT_RISE,
         simpler=free.rotations,
         simpler_share=max(share, least),
-        adjustable=None if path.is_loose else turn.by_velocity(),
+        adjustable=adjustable,
         reason=f"{path}, {speed:.2f} degrees a frame, {verdict.reason}; {free.reason}",
     )
 

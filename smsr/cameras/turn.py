@@ -53,21 +53,29 @@ class Turn:
         turned: NDArray[np.float64] = so3.exp(self.angles[:, None] * self.velocity) @ self.start
         return turned
 
-    def by_velocity(self) -> NDArray[np.float64]:
-        """Return how the cameras change with the velocity, about that of the middle frame.
+    @property
+    def span(self) -> float:
+        """Range of the angles, at least a frame of full velocity."""
+        return max(float(np.ptp(self.angles)), 1.0)
+
+    def by_velocity(self, fixed: float = 0.0) -> NDArray[np.float64]:
+        """Return how the cameras turn as the velocity changes.
+
+        Parameters
+        ----------
+        fixed : float
+            The angle at which the camera stays.
 
         Returns
         -------
         ndarray of shape (3, T, 3)
             For each axis of the camera frame the rotation vectors, in the frames of the cameras,
-            where the velocity changes by one radian over the range of the angles.
+            by a change of one radian a frame.
         """
-        middle = self.angles[len(self.angles) // 2]
-        gone = self.angles - middle
-        parts = gone / max(float(np.ptp(gone)), np.finfo(float).tiny)
-        fields = so3.left_jacobian(gone[:, None] * self.velocity) * parts[:, None, None]
-        seen: NDArray[np.float64] = (so3.exp(self.shake) @ fields).transpose(2, 0, 1)
-        return seen
+        gone = (self.angles - fixed)[:, None]
+        turned = so3.exp(self.shake) @ (so3.left_jacobian(gone * self.velocity) * gone[:, None])
+        fields: NDArray[np.float64] = turned.transpose(2, 0, 1)
+        return fields
 
     def every(self, step: int) -> Turn:
         """Return the turn of every n-th frame."""
@@ -149,15 +157,13 @@ def refine_velocity(
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    span = max(float(np.ptp(turn.angles)), 1.0)
     problem = DepthProblem(measurements, turn.rotations)
     problem.start_from_least_motion()
     problem.motion_weight = motion_weight
-    shake = so3.exp(turn.shake)
     count = 0
 
     def at(x: NDArray[np.float64]) -> Turn:
-        return dataclasses.replace(turn, velocity=turn.velocity + x / span)
+        return dataclasses.replace(turn, velocity=turn.velocity + x / turn.span)
 
     def energy(x: NDArray[np.float64], *_: object) -> tuple[float, NDArray[np.float64]]:
         nonlocal count
@@ -166,10 +172,8 @@ def refine_velocity(
         problem.minimise(60, 3e-4)
         count += 1
         hook(min(count / evaluations, 1.0), count, problem.residuals[-1])
-        by_velocity = so3.left_jacobian(turn.angles[:, None] * now.velocity)
-        by_velocity = shake @ (by_velocity * turn.angles[:, None, None])
-        gradient = np.einsum("tij,ti->j", by_velocity, problem.camera_gradient()) / span
-        return problem.value(), gradient
+        gradient = np.tensordot(now.by_velocity(), problem.camera_gradient(), axes=2)
+        return problem.value(), gradient / turn.span
 
     found = minimize(
         energy,

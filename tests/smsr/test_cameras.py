@@ -304,7 +304,7 @@ class TestTurn:
         turn = fit_uniform_turn(orbit(60))
         shake = np.radians(1.0) * np.random.default_rng(0).standard_normal((60, 3))
         turn = dataclasses.replace(turn, angles=2.0 * turn.angles + 7.0, shake=shake)
-        fields = turn.by_velocity()
+        fields = turn.by_velocity(turn.angles[30]) / turn.span
         assert not fields[:, 30].any()
         change = 1e-6 * np.array([0.4, -0.7, 0.2])
         span = turn.angles[-1] - turn.angles[0]
@@ -641,10 +641,11 @@ class TestGauge:
 
     def test_cameras_can_be_adjusted_before_or_after(self) -> None:
         turn = fit_uniform_turn(orbit(21))
-        turns = np.tensordot([0.1, 0.05, -0.2], turn.by_velocity(), axes=1)
+        velocity = turn.by_velocity(turn.angles[10]) / turn.span
+        turns = np.tensordot([0.1, 0.05, -0.2], velocity, axes=1)
         adjusted = self.fixed(so3.exp(turns) @ turn.rotations)
         for mirrored in (False, True):
-            fields, G = turn.by_velocity(), turn.rotations
+            fields, G = velocity, turn.rotations
             if mirrored:
                 fields, G = fields * [-1.0, -1.0, 1.0], so3.mirror(G)
             fixed = fix_gauge(CameraEstimate(G, "uniform", 1, 1, True, "", adjustable=fields))

@@ -145,9 +145,9 @@ class TestCondition:
 def test_turning_force_is_the_gradient_of_the_likelihood(correlation: float) -> None:
     deformation, rotations = model(3, correlation), turning(5, 20.0)
     shapes = sample(deformation, 5)
-    seen = rotations[:, :2] @ shapes
-    posterior = condition(deformation, without_depth(shapes, rotations), rotations[:, 2])
-    force = turning_force(deformation, seen, rotations, posterior)
+    planar = without_depth(shapes, rotations)
+    posterior = condition(deformation, planar, rotations[:, 2])
+    force = turning_force(deformation, planar, rotations, posterior)
     expected = np.zeros_like(force)
     step = 1e-5
     for t, axis in np.ndindex(5, 3):
