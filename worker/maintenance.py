@@ -10,7 +10,9 @@ import time
 from typing import TYPE_CHECKING, cast
 
 import structlog
+from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import RedisError
+from redis.exceptions import TimeoutError as RedisTimeoutError
 
 from worker.records import PREFIX
 from worker.storage import StorageError
@@ -67,6 +69,10 @@ class Maintenance:
         ):
             try:
                 part()
+            except (RedisConnectionError, RedisTimeoutError) as error:
+                # All parts need Redis, and each would wait for it in turn.
+                log.warning("maintenance waits for Redis", part=part.__name__, reason=str(error))
+                return
             except (RedisError, StorageError) as error:
                 log.warning("maintenance is put off", part=part.__name__, reason=str(error))
 

@@ -5,12 +5,14 @@ import time
 from typing import TYPE_CHECKING, cast
 
 import pytest
+from structlog.testing import capture_logs
 
 from worker.maintenance import Maintenance, last_maintenance
 from worker.queue import FORMER_TICKET_TTL, JobQueue
 from worker.records import PREFIX, JobActive, JobExists, result_prefix, upload_prefix
 
 if TYPE_CHECKING:
+    from tests.conftest import RedisProcess
     from tests.worker.conftest import Submitter
     from worker.settings import Settings
 
@@ -198,6 +200,21 @@ def test_maintenance_outlives_a_failing_storage(queue: JobQueue, submit: Submitt
     queue.redis.zadd("smsr:garbage", {f"uploads/{job_id}/": 1})
     Maintenance(queue).run_once()
     assert queue.redis.zscore("smsr:garbage", f"uploads/{job_id}/") is None
+
+
+def test_maintenance_waits_for_redis_once(queue: JobQueue, redis_process: RedisProcess) -> None:
+    """Not in every one of its parts, or it would still be waiting when Redis is back."""
+    keeper = Maintenance(queue)
+    redis_process.kill()
+    try:
+        with capture_logs() as lines:
+            keeper.run_once()
+    finally:
+        redis_process.start()
+    assert [line["event"] for line in lines] == ["maintenance waits for Redis"]
+    assert last_maintenance(queue.redis) is None
+    keeper.run_once()
+    assert last_maintenance(queue.redis) is not None
 
 
 def test_the_queue_needs_a_server(settings: Settings) -> None:
