@@ -50,6 +50,8 @@ class ShapeEstimate:
         See `DepthProblem.complexity`; 0 where it was not measured.
     flicker : float
         See `flicker`; 0 where it was not measured.
+    steadiness : float
+        See `steadiness`; 0 where it was not measured.
     rotations : ndarray of shape (T, 3, 3), optional
         The cameras, where they were adjusted with the shapes.
     """
@@ -61,6 +63,7 @@ class ShapeEstimate:
     residuals: tuple[float, ...] = ()
     complexity: float = 0.0
     flicker: float = 0.0
+    steadiness: float = 0.0
     rotations: NDArray[np.float64] | None = None
 
 
@@ -368,6 +371,7 @@ def estimate_shapes(
             noise,
             points=points,
             adjustable=adjustable,
+            doubtful=deep,
             max_iterations=options.shape_iterations,
             hook=second,
         )
@@ -671,6 +675,7 @@ def with_likely_depth(
     *,
     points: NDArray[np.float64] | None = None,
     adjustable: NDArray[np.float64] | None = None,
+    doubtful: bool = False,
     max_iterations: int = 1000,
     hook: StageHook = ignore,
 ) -> ShapeEstimate:
@@ -697,12 +702,11 @@ def with_likely_depth(
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    part = faded(estimate.complexity, LIKELY)
-    part *= max(1.0 - noise / _LIKELY_NOISE, 0.0)
+    part, certain = faded(estimate.complexity, LIKELY), max(1.0 - noise / _LIKELY_NOISE, 0.0)
     # The more frames there are, the surer is each round, and the longer it takes.
     rounds = max(_LEAST_ROUNDS, min(_MOST_ROUNDS, _FRAMES_IN_ALL_ROUNDS // len(rotations)))
     rounds = min(rounds, max_iterations - estimate.iterations)
-    if part == 0.0 or rounds < 1:
+    if certain == 0.0 or (part == 0.0 and not doubtful) or rounds < 1:
         return estimate
     # Directions that carry little of the tracks have hardly any depth, and cost as much as others.
     seen = (rotations[:, :2] @ estimate.shapes).reshape(2 * len(rotations), -1)
@@ -733,6 +737,8 @@ def with_likely_depth(
         tolerance=_LIKELY_TOLERANCE,
         hook=hook,
     )
+    steady = steadiness(seen @ directions, likely.shapes)
+    part = max(part, steady) * certain
     part *= 1.0 - (1.0 - likely.support) * estimate.flicker / _MOST_BY_HASTE
     shapes, others, adjusted = estimate.shapes, likely.shapes, None
     if adjustment is not None:
@@ -742,11 +748,38 @@ def with_likely_depth(
     return dataclasses.replace(
         estimate,
         shapes=shapes + part * (others - some) @ directions.T,
+        steadiness=steady,
         rotations=adjusted,
         iterations=estimate.iterations + likely.iterations,
         reason=f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them, "
         f"{likely.support:.0%} of points with lengths that keep",
     )
+
+
+_STEADY = (1.0, 3.0)
+
+
+def steadiness(measurements: NDArray[np.float64], shapes: NDArray[np.float64]) -> float:
+    """Return how sure shapes are that move more steadily than the tracks, 0 to 1.
+
+    A camera held in the hand shakes, and an object rarely does: where the second differences in
+    time of the tracks are much larger than those of the shapes, cameras and depths explain the
+    shake, which wrong ones cannot.
+
+    Parameters
+    ----------
+    measurements : ndarray of shape (2T, N)
+        W.
+    shapes : ndarray of shape (T, 3, N)
+        S.
+    """
+    frames = len(shapes)
+    shaken = np.diff(measurements.reshape(frames, -1), n=2, axis=0)
+    moved = np.diff(shapes.reshape(frames, -1), n=2, axis=0)
+    tiny = np.finfo(float).tiny
+    ratio = float((shaken**2).sum()) / max(float((moved**2).sum()), tiny)
+    low, high = _STEADY
+    return min(max(math.log(max(ratio, tiny) / low) / math.log(high / low), 0.0), 1.0)
 
 
 DOUBTFUL = 0.6
@@ -783,7 +816,7 @@ def with_deep_shapes(
     noise : float
         As a part of the tracks' spread: the more there was, the less does simplicity say.
     """
-    part = faded(deep.complexity, _DEEP) * _trust(noise)
+    part = max(faded(deep.complexity, _DEEP), deep.steadiness) * _trust(noise)
     if part == 0.0:
         return estimate
     seen = rotations @ deep.shapes
@@ -869,7 +902,7 @@ def credible_depth(estimate: ShapeEstimate, rotations: NDArray[np.float64]) -> S
     seen = rotations @ estimate.shapes
     depth, image = (seen[:, 2] ** 2).mean(), (seen[:, :2] ** 2).mean()
     ratio = math.sqrt(depth / max(image, np.finfo(float).tiny))
-    keep = faded(estimate.complexity, FLAT)
+    keep = max(faded(estimate.complexity, FLAT), estimate.steadiness)
     keep *= min(1.0, _DEEPEST / max(ratio, np.finfo(float).tiny))
     if keep == 1.0:
         return estimate

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,8 +21,6 @@ from smsr.progress import ignore, part_of
 from smsr.shapes import DepthProblem
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from smsr.cameras.estimate import CameraEstimate
@@ -32,6 +31,12 @@ RELAXATIONS = ((10, 1e-3), (3, 1e-3), (2, 1e-3), (10, 4e-3), (10, 1.6e-2))
 
 _CLEAN_WEIGHT = 2.5e-4  # of the first relaxation
 _NOISY = 0.02  # noise, as a part of the tracks' spread, from which on its weight is the full one
+
+_LIGHTER = (0.3, 0.1, 0.03)
+"""Parts of the first weight that are tried as well."""
+
+_NOISIEST = 0.1
+"""Noise, as a part of the tracks' spread, from which on simple shapes tell nothing of the trace."""
 
 _CERTAIN = 0.3
 """Complexity below which the first relaxation is right and no other is tried."""
@@ -82,17 +87,17 @@ def free_cameras(
         square angle in degrees to the cameras of a relaxation that is nearly as good.
     """
     most = max(1, len(values) // 3)
-    settings = [(basis_size or 10, RELAXATIONS[0][1])]
-    if basis_size is None:
-        share = min(noise / _NOISY, 1.0) ** 2
-        first = (RELAXATIONS[0][0], max(_CLEAN_WEIGHT, RELAXATIONS[0][1] * share))
-        tried = (first, *RELAXATIONS[1:])
-        settings = list(dict.fromkeys((min(K, most), weight) for K, weight in tried))
+    share = min(noise / _NOISY, 1.0) ** 2
+    first = (RELAXATIONS[0][0], max(_CLEAN_WEIGHT, RELAXATIONS[0][1] * share))
+    tried = (first, *((first[0], part * first[1]) for part in _LIGHTER), *RELAXATIONS[1:])
+    settings = list(dict.fromkeys((min(K, most), weight) for K, weight in tried))
+    if basis_size is not None:
+        settings = [(basis_size, RELAXATIONS[0][1])]
     largest = usable_rank(values, 3 * max(K for K, _ in settings))
     form = orthonormality_form(scaled_motion(left, values, largest), unit_scale=True)
-    found: list[CameraEstimate] = []
-    scores: list[float] = []
-    for index, (K, weight) in enumerate(settings):
+
+    def relax(index: int) -> _Relaxation:
+        K, weight = settings[index]
         estimate = relaxed_cameras(
             left,
             values,
@@ -103,40 +108,62 @@ def free_cameras(
             tolerance=tolerance,
             hook=part_of(hook, index / len(settings), (index + 1) / len(settings)),
         )
-        found.append(estimate)
-        scores.append(complexity(left * values, estimate.rotations))
-        if scores[0] < _CERTAIN or _agree(found, scores):
-            break
-    best = _best(scores)
+        reason = f"relaxation with K = {K} and trace weight {weight:g}: {estimate.reason}"
+        return _Relaxation(
+            dataclasses.replace(estimate, reason=reason),
+            complexity(left * values, estimate.rotations),
+        )
+
+    plain = best = relax(0)
+    found = [plain]
+    lighter, others = range(1, 1 + len(_LIGHTER)), range(1 + len(_LIGHTER), len(settings))
+    if basis_size is None and noise < _NOISIEST:
+        for index in lighter:
+            found.append(relax(index))
+            if found[-1].complexity >= best.complexity:
+                break
+            best = found[-1]
+    if basis_size is None and best.complexity >= _CERTAIN:
+        for index in others:
+            other = relax(index)
+            found.append(other)
+            if _is_clearly_simpler(other, plain) and other.complexity < best.complexity:
+                best = other
+            if index == others[0] and _agree(plain, other):
+                break
     angles = [
-        angle_between(found[best].rotations, other.rotations)
-        for other, score in zip(found, scores, strict=True)
-        if score <= _AS_GOOD * scores[best]
+        angle_between(best.estimate.rotations, other.estimate.rotations)
+        for other in found
+        if other.complexity <= _AS_GOOD * best.complexity
     ]
-    K, weight = settings[best]
     return dataclasses.replace(
-        found[best],
-        reason=f"relaxation with K = {K} and trace weight {weight:g}: {found[best].reason}",
-        criteria={"complexity": scores[best], "disagreement": math.degrees(max(angles))},
+        best.estimate,
+        criteria={"complexity": best.complexity, "disagreement": math.degrees(max(angles))},
     )
 
 
-def _agree(found: Sequence[CameraEstimate], scores: Sequence[float]) -> bool:
-    """Tell whether the first two relaxations give much the same credible cameras.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Relaxation:
+    """Cameras, and the complexity of the shapes they give."""
+
+    estimate: CameraEstimate
+    complexity: float
+
+
+def _agree(first: _Relaxation, second: _Relaxation) -> bool:
+    """Tell whether two relaxations of unlike K give much the same credible cameras.
 
     They fail grossly in different ways, so then neither has failed.
     """
-    if len(found) != 2 or scores[0] >= _CREDIBLE or scores[1] < _CLEARLY_LOWER * scores[0]:
+    if first.complexity >= _CREDIBLE or second.complexity < _CLEARLY_LOWER * first.complexity:
         return False
-    return angle_between(found[0].rotations, found[1].rotations) < _AGREEMENT
+    return angle_between(first.estimate.rotations, second.estimate.rotations) < _AGREEMENT
 
 
-def _best(scores: Sequence[float]) -> int:
-    """Return the first relaxation unless another has a clearly lower complexity."""
-    best = int(np.argmin(scores))
-    clear = scores[best] < _CLEARLY_LOWER * scores[0]
-    credible = scores[best] < _CREDIBLE or scores[0] > 1.0
-    return best if clear and credible else 0
+def _is_clearly_simpler(other: _Relaxation, first: _Relaxation) -> bool:
+    """Tell whether a relaxation gives so much simpler shapes than the first that that failed."""
+    clear = other.complexity < _CLEARLY_LOWER * first.complexity
+    return clear and (other.complexity < _CREDIBLE or first.complexity > 1.0)
 
 
 def complexity(measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> float:

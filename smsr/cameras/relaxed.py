@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from smsr.progress import StageHook
 
 _RELAXATION = 1.6
+_LEAST_PENALTY = 5e-4  # down to it the penalty is the weight of the trace
 
 
 def relaxed_cameras(
@@ -95,7 +97,7 @@ def relaxed_factor(
     The splitting F = Z gives a linear system with one and the same matrix in every iteration and
     an eigenvalue thresholding. The penalty equal to the weight of the trace thresholds eigenvalues
     at 1, the size that F has for cameras of unit scale, and converges in some tens of iterations
-    where accelerated gradient steps need a thousand.
+    where accelerated gradient steps need a thousand; a light trace needs a larger one.
 
     Parameters
     ----------
@@ -116,7 +118,7 @@ def relaxed_factor(
         form = orthonormality_form(motion, unit_scale=True)
     form = form.leading(n)
     H, b = form.hessian / frames, form.linear / frames
-    penalty = trace_weight
+    penalty = max(trace_weight, math.sqrt(trace_weight * _LEAST_PENALTY))
     system = cho_factor(H + penalty * np.eye(len(H)), check_finite=False)
     z = symmetric_vector(np.diag((np.arange(n) < 3).astype(np.float64)))
     u = np.zeros_like(z)
