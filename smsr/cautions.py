@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smsr.result import Caution
+from smsr.rotations import spread_of_views
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -105,10 +106,7 @@ def gap_cautions(missing: float, rejected: float) -> list[Caution]:
 def camera_cautions(rotations: NDArray[np.float64], estimate: CameraEstimate) -> list[Caution]:
     """Judge cameras (T, 3, 3) by the spread of viewing directions and how well they are decided."""
     found = []
-    axes = rotations[:, 2]
-    # The farthest from the farthest: nearly the widest angle, without comparing all pairs.
-    far = axes[(axes @ axes[0]).argmin()]
-    spread = math.acos(min(1.0, max(-1.0, float((axes @ far).min()))))
+    spread = spread_of_views(rotations)
     if spread < _LITTLE_ROTATION:
         found.append(
             Caution(

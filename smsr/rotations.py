@@ -90,3 +90,11 @@ def mirror(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     flip = np.array([1.0, 1.0, -1.0])
     return complete(rotations[:, :2] * flip)
+
+
+def spread_of_views(rotations: NDArray[np.float64]) -> float:
+    """Return about the widest angle, in radians, between viewing directions of (T, 3, 3)."""
+    axes = rotations[:, 2]
+    # The farthest from the farthest: nearly the widest angle, without comparing all pairs.
+    far = axes[(axes @ axes[0]).argmin()]
+    return float(np.arccos(np.clip((axes @ far).min(), -1.0, 1.0)))

@@ -21,7 +21,7 @@ from smsr.deformation import likely_shapes
 from smsr.lengths import Lengths, chosen_points
 from smsr.progress import ignore, part_of
 from smsr.proximal import singular_value_threshold, singular_values
-from smsr.rotations import depths_along
+from smsr.rotations import depths_along, spread_of_views
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -757,14 +757,16 @@ def with_likely_depth(
 
 
 _STEADY = (1.0, 3.0)
+_UNSTEADY = (0.1, 0.25)
 
 
 def steadiness(measurements: NDArray[np.float64], shapes: NDArray[np.float64]) -> float:
-    """Return how sure shapes are that move more steadily than the tracks, 0 to 1.
+    """Return what the steadiness of the shapes says for them: 1 for sure, 0 nothing, -1 against.
 
     A camera held in the hand shakes, and an object rarely does: where the second differences in
     time of the tracks are much larger than those of the shapes, cameras and depths explain the
-    shake, which wrong ones cannot.
+    shake, which wrong ones cannot. Where shapes move and shake far more than the tracks, all of
+    that is motion along the viewing direction, which the tracks cannot have told.
 
     Parameters
     ----------
@@ -773,13 +775,16 @@ def steadiness(measurements: NDArray[np.float64], shapes: NDArray[np.float64]) -
     shapes : ndarray of shape (T, 3, N)
         S.
     """
-    frames = len(shapes)
-    shaken = np.diff(measurements.reshape(frames, -1), n=2, axis=0)
-    moved = np.diff(shapes.reshape(frames, -1), n=2, axis=0)
-    tiny = np.finfo(float).tiny
-    ratio = float((shaken**2).sum()) / max(float((moved**2).sum()), tiny)
+    frames, tiny = len(shapes), np.finfo(float).tiny
+    ratios = []
+    for order in (1, 2):
+        seen = np.diff(measurements.reshape(frames, -1), n=order, axis=0)
+        moved = np.diff(shapes.reshape(frames, -1), n=order, axis=0)
+        ratios.append(max(float((seen**2).sum()), tiny) / max(float((moved**2).sum()), tiny))
+    motion, shake = ratios
     low, high = _STEADY
-    return min(max(math.log(max(ratio, tiny) / low) / math.log(high / low), 0.0), 1.0)
+    sure = min(max(math.log(shake / low) / math.log(high / low), 0.0), 1.0)
+    return sure - faded(motion * shake, _UNSTEADY)
 
 
 DOUBTFUL = 0.6
@@ -788,6 +793,7 @@ DOUBTFUL = 0.6
 _DEEP = (0.7, 0.85)  # complexities between which the deep shapes lose their part
 _DEEPEST_BY_WIDTH = 1.25
 _NOISIEST = 0.15  # part of the tracks' spread
+_FEW_VIEWS = (math.radians(30.0), math.radians(45.0))
 
 
 def _trust(noise: float) -> float:
@@ -805,7 +811,8 @@ def with_deep_shapes(
 
     Where the camera turns little, the nuclear norm hardly changes between the two, and one has too
     little depth and the other often too much. Deep shapes count as far as they make the shapes
-    simpler, and with little more depth than the object is wide.
+    simpler or are steadier than the tracks, and with little more depth than the object is wide;
+    where the camera hardly turns, all depth is taken back if they are far less steady.
 
     Parameters
     ----------
@@ -817,7 +824,9 @@ def with_deep_shapes(
         As a part of the tracks' spread: the more there was, the less does simplicity say.
     """
     part = max(faded(deep.complexity, _DEEP), deep.steadiness) * _trust(noise)
-    if part == 0.0:
+    doubt = faded(spread_of_views(rotations), _FEW_VIEWS) * _trust(noise)
+    keep = 1.0 + doubt * min(deep.steadiness, 0.0)
+    if part == 0.0 and keep == 1.0:
         return estimate
     seen = rotations @ deep.shapes
     depth = math.sqrt(float((seen[:, 2] ** 2).mean()))
@@ -827,7 +836,7 @@ def with_deep_shapes(
     depths = min(1.0, width / max(depth, np.finfo(float).tiny)) * seen[:, 2]
     axis = rotations[:, 2]
     present = depths_along(axis, estimate.shapes)
-    change = part * (depths - present)
+    change = keep * (present + part * (depths - present)) - present
     return dataclasses.replace(
         estimate,
         shapes=estimate.shapes + axis[:, :, None] * change[:, None],
