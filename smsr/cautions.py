@@ -25,6 +25,7 @@ _LOST = 0.01
 _NOISY = 0.02
 _UNDECIDED = 10.0  # degrees
 _WEAK_DEPTH = 0.75
+_STEADY = 0.5
 _LITTLE_ROTATION = math.radians(10.0)
 
 
@@ -128,9 +129,17 @@ def camera_cautions(rotations: NDArray[np.float64], estimate: CameraEstimate) ->
     return found
 
 
-def depth_cautions(complexity: float) -> list[Caution]:
-    """Judge how much simpler depth makes the shapes, see `DepthProblem.complexity`."""
-    if complexity <= _WEAK_DEPTH:
+def depth_cautions(complexity: float, steadiness: float) -> list[Caution]:
+    """Judge how much simpler and steadier depth makes the shapes.
+
+    Parameters
+    ----------
+    complexity : float
+        See `smsr.shapes.DepthProblem.complexity`.
+    steadiness : float
+        See `smsr.shapes.steadiness`.
+    """
+    if complexity <= _WEAK_DEPTH or steadiness > _STEADY:
         return []
     return [
         Caution(

@@ -227,7 +227,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
         cautions=(
             *input_cautions(space.singular_values, points, space.points),
             *camera_cautions(rotations, estimate),
-            *depth_cautions(found.complexity),
+            *depth_cautions(found.complexity, found.steadiness),
             *convergence_cautions(clock.reports),
         ),
     )

@@ -697,6 +697,8 @@ def with_likely_depth(
         Some real points in terms of the q that the shapes have; without it, these are real.
     adjustable : ndarray of shape (k, T, 3), optional
         What may change of the cameras, see `smsr.adjustment`. They do as far as the depths count.
+    doubtful : bool
+        Do this for doubtful depths, too: how steady the shapes become then may remove the doubt.
     max_iterations : int
         Of all, those that the estimate took included.
     hook : callable
@@ -837,12 +839,16 @@ def with_deep_shapes(
     axis = rotations[:, 2]
     present = depths_along(axis, estimate.shapes)
     change = keep * (present + part * (depths - present)) - present
+    reason = f"{estimate.reason}; {part:.0%} of shapes with full depth: {deep.reason}"
+    if keep < 1.0:
+        reason += f"; {keep:.0%} of the depth was kept, for it moves more than the tracks"
     return dataclasses.replace(
         estimate,
         shapes=estimate.shapes + axis[:, :, None] * change[:, None],
+        steadiness=deep.steadiness,
         iterations=estimate.iterations + deep.iterations,
         converged=estimate.converged and deep.converged,
-        reason=f"{estimate.reason}; {part:.0%} of shapes with full depth: {deep.reason}",
+        reason=reason,
     )
 
 

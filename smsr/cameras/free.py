@@ -33,7 +33,8 @@ _CLEAN_WEIGHT = 2.5e-4  # of the first relaxation
 _NOISY = 0.02  # noise, as a part of the tracks' spread, from which on its weight is the full one
 
 _LIGHTER = (0.3, 0.1, 0.03)
-"""Parts of the first weight that are tried as well."""
+"""Parts of the first weight that are tried as well, for as long as the shapes get simpler: a heavy
+trace makes cameras that turn little stand still, a light one fits noise."""
 
 _NOISIEST = 0.1
 """Noise, as a part of the tracks' spread, from which on simple shapes tell nothing of the trace."""
@@ -50,7 +51,7 @@ _CREDIBLE = 0.75
 _AGREEMENT = math.radians(6.0)
 _AS_GOOD = 1.05  # relaxations of complexities within this factor are equally likely
 _FRAMES = 200
-_DIRECTIONS = 24
+_DIRECTIONS = 18
 
 
 def free_cameras(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from smsr.progress import StageHook
 
 _RELAXATION = 1.6
+_BALANCE_EVERY, _BALANCE, _MOST_CHANGE = 25, 2.0, 5.0
 _LEAST_PENALTY = 5e-4  # down to it the penalty is the weight of the trace
 
 
@@ -97,7 +98,8 @@ def relaxed_factor(
     The splitting F = Z gives a linear system with one and the same matrix in every iteration and
     an eigenvalue thresholding. The penalty equal to the weight of the trace thresholds eigenvalues
     at 1, the size that F has for cameras of unit scale, and converges in some tens of iterations
-    where accelerated gradient steps need a thousand; a light trace needs a larger one.
+    where accelerated gradient steps need a thousand; a light trace needs a larger one. Where one of
+    the two residuals runs ahead of the other all the same, it is changed (residual balancing).
 
     Parameters
     ----------
@@ -130,9 +132,16 @@ def relaxed_factor(
         z = symmetric_vector(eigenvalue_threshold(symmetric_matrix(x), trace_weight / penalty))
         u = x - z
         size = max(float(np.linalg.norm(z)), np.finfo(float).tiny)
-        primal, dual = np.linalg.norm(f - z) / size, np.linalg.norm(z - previous) / size
-        residuals.append(float(max(primal, dual)))
+        primal = float(np.linalg.norm(f - z)) / size
+        dual = float(np.linalg.norm(z - previous)) / size
+        residuals.append(max(primal, dual))
         hook(iteration / max_iterations, iteration, residuals[-1])
         if residuals[-1] < tolerance:
             break
+        if iteration % _BALANCE_EVERY == 0:
+            change = math.sqrt(primal / max(dual, np.finfo(float).tiny))
+            change = min(max(change, 1.0 / _MOST_CHANGE), _MOST_CHANGE)
+            if not 1.0 / _BALANCE < change < _BALANCE:
+                penalty, u = change * penalty, u / change
+                system = cho_factor(H + penalty * np.eye(len(H)), check_finite=False)
     return symmetric_matrix(z), tuple(residuals)

@@ -28,6 +28,7 @@ from smsr.cameras.selection import part_outside_span, with_simple_path, with_uni
 from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
 from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
+from tests.shaken import shaken as shaken_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -245,10 +246,32 @@ class TestFree:
             assert chosen.criteria["disagreement"] >= 0.0
             assert_cameras(chosen.rotations)
 
-    @pytest.mark.parametrize(("noise", "weight"), [(0.0, "0.00025"), (0.5, "0.001")])
-    def test_the_less_noise_the_less_weight_of_the_trace(self, noise: float, weight: str) -> None:
+    @pytest.mark.parametrize(("noise", "first"), [(0.0, 2.5e-4), (0.01, 2.5e-4), (0.5, 1e-3)])
+    def test_the_less_noise_the_less_weight_of_the_trace(self, noise: float, first: float) -> None:
         left, values = low_rank(swing(), modes=1)
-        assert f"trace weight {weight}:" in free_cameras(left, values, noise=noise).reason
+        weight = self.weight(free_cameras(left, values, noise=noise))
+        assert any(weight == pytest.approx(part * first) for part in (1.0, 0.3, 0.1, 0.03))
+
+    @staticmethod
+    def weight(found: CameraEstimate) -> float:
+        return float(found.reason.partition("trace weight ")[2].partition(":")[0])
+
+    def test_a_lighter_trace_lets_cameras_turn_that_turn_little(self) -> None:
+        W, true, _ = shaken_tracks()
+        left, values, _ = np.linalg.svd(W, full_matrices=False)
+        left, values = left[:, :9], values[:9] / values[0]
+        first = relaxed_cameras(left, values, basis_size=3, trace_weight=2.5e-4)
+        found = free_cameras(left, values)
+        assert so3.spread_of_views(first.rotations) < 0.01 < 0.15 < so3.spread_of_views(true)
+        assert so3.spread_of_views(found.rotations) > 0.15
+        assert self.weight(found) < 1e-4
+        assert found.criteria["complexity"] < complexity(left * values, first.rotations)
+
+    def test_of_very_noisy_tracks_no_lighter_trace_is_tried(self) -> None:
+        W, _, _ = shaken_tracks()
+        left, values, _ = np.linalg.svd(W, full_matrices=False)
+        found = free_cameras(left[:, :9], values[:9] / values[0], noise=0.1)
+        assert self.weight(found) >= 1e-3
 
     def test_a_given_basis_size_leaves_no_choice(self) -> None:
         left, values = low_rank(swing(), modes=2)

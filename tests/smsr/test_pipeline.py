@@ -12,14 +12,16 @@ from threadpoolctl import threadpool_info
 import smsr
 from smsr import Progress, evaluate, reconstruct
 from smsr import rotations as so3
+from smsr.benchmark.camera_paths import errors
 from smsr.cameras import estimate_cameras, fix_gauge
 from smsr.errors import Cancelled, InvalidOption, UnknownOption
 from smsr.options import Options, resolve
 from smsr.pipeline import STAGES
 from smsr.rotations import complete
-from smsr.shapes import estimate_shapes
+from smsr.shapes import estimate_shapes, planar_shapes
 from smsr.synthetic import make_example, make_low_rank
 from tests.limbs import limbs, turning
+from tests.shaken import shaken
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -453,6 +455,24 @@ class TestDegenerateInput:
     def test_user_is_cautioned(self, name: str, code: str) -> None:
         cautions = reconstruct(degenerate()[name]).diagnostics.cautions
         assert code in [caution.code for caution in cautions]
+
+    @pytest.mark.parametrize("seed", [0, 1, 2])
+    def test_a_camera_held_in_the_hand_shows_depth(self, seed: int) -> None:
+        """By its shake alone: cameras that stand still explain the tracks about as well."""
+        W, cameras, shapes = shaken(seed=seed)
+        result = reconstruct(W)
+        found = errors(result.cameras, result.shapes.transpose(0, 2, 1), cameras, shapes)
+        flat = errors(cameras[:, :2], planar_shapes(W, cameras), cameras, shapes)
+        assert found.camera < 0.15 < 0.6 < flat.camera
+        assert "weak-depth" not in {caution.code for caution in result.diagnostics.cautions}
+
+    def test_a_still_camera_shows_none(self) -> None:
+        _, _, shapes = shaken()
+        W = shapes[:, :2].reshape(len(shapes) * 2, -1)
+        result = reconstruct(W)
+        depth = np.linalg.norm(result.shapes[..., 2]) / np.linalg.norm(result.shapes[..., :2])
+        assert depth < 0.1
+        assert "weak-depth" in {caution.code for caution in result.diagnostics.cautions}
 
     def test_good_input_is_not_cautioned(self, example: smsr.synthetic.Example) -> None:
         assert reconstruct(example.measurements).diagnostics.cautions == ()

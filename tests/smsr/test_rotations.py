@@ -62,3 +62,10 @@ def test_a_mirrored_camera_sees_the_mirrored_shape_the_same() -> None:
     seen = mirrored[:, :2] @ (S * np.array([1.0, 1.0, -1.0])[:, None])
     np.testing.assert_allclose(seen, G[:, :2] @ S, atol=1e-14)
     np.testing.assert_allclose(so3.mirror(mirrored), G, atol=1e-14)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 180.0])
+def test_spread_of_views_is_the_widest_angle(degrees: float) -> None:
+    angles = np.radians(degrees) * np.array([0.3, 0.0, 0.9, 1.0, 0.5])
+    rotations = so3.exp(angles[:, None] * np.array([0.0, 1.0, 0.0])) @ random_rotations(1)
+    assert so3.spread_of_views(rotations) == pytest.approx(np.radians(degrees), abs=1e-7)

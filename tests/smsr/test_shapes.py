@@ -23,11 +23,13 @@ from smsr.shapes import (
     published_shapes,
     reweighted_shapes,
     rigid_shapes,
+    steadiness,
     with_deep_shapes,
     with_likely_depth,
     with_mean_depth,
 )
 from tests.limbs import limbs, turning
+from tests.shaken import shaken
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -290,6 +292,15 @@ class TestLikelyDepth:
         assert self.moved(complexity=0.65) == pytest.approx(0.5 * full)
         assert self.moved(complexity=0.75) == 0.0
 
+    def test_steady_shapes_remove_the_doubt(self) -> None:
+        W, rotations, shapes = shaken()
+        found = low_rank_shapes(W, rotations)
+        doubtful = dataclasses.replace(found, complexity=0.9)
+        assert with_likely_depth(doubtful, rotations) is doubtful
+        likely = with_likely_depth(doubtful, rotations, doubtful=True)
+        assert likely.steadiness == 1.0
+        assert relative_error(likely.shapes, shapes) < 0.5 * relative_error(found.shapes, shapes)
+
     def test_it_counts_less_where_the_motion_flickered(self) -> None:
         assert self.moved(flicker=1.0) == pytest.approx(0.5 * self.moved(), rel=0.05)
         assert self.moved(flicker=2.0) < 0.05 * self.moved()
@@ -451,6 +462,30 @@ class TestAdjustedCameras:
         np.testing.assert_allclose(seen, self.W, atol=1e-9)
 
 
+class TestSteadiness:
+    def test_shapes_that_explain_a_shake_are_sure(self) -> None:
+        W, _, shapes = shaken()
+        assert steadiness(W, shapes) == 1.0
+
+    def test_flat_shapes_shake_as_the_tracks_do(self) -> None:
+        W, rotations, _ = shaken()
+        still = np.broadcast_to(np.eye(3), rotations.shape)
+        assert steadiness(W, planar_shapes(W, still)) == 0.0
+        assert steadiness(7.0 * W, 7.0 * planar_shapes(W, still)) == 0.0
+
+    def test_depth_that_moves_on_its_own_speaks_against_itself(self) -> None:
+        W, rotations, shapes = shaken()
+        depths = np.random.default_rng(0).standard_normal(shapes[:, :1].shape)
+        restless = shapes + rotations[:, 2][:, :, None] * depths
+        assert steadiness(W, restless) == -1.0
+
+    @pytest.mark.parametrize("frames", [2, 3])
+    def test_of_few_frames_it_is_a_number(self, frames: int) -> None:
+        W, _, shapes = shaken(frames)
+        assert -1.0 <= steadiness(W, shapes) <= 1.0
+        assert steadiness(np.zeros_like(W), np.zeros_like(shapes)) == 0.0
+
+
 class TestTwoSolutions:
     def estimates(self, complexity: float) -> tuple[Array, Array, ShapeEstimate, ShapeEstimate]:
         """Return W, cameras, a solution and one with half of its depth and a complexity."""
@@ -481,6 +516,27 @@ class TestTwoSolutions:
         seen = rotations @ with_deep_shapes(flat, far, rotations).shapes
         width = np.linalg.norm(seen[:, :2].transpose(1, 0, 2).reshape(2, -1), 2)
         assert np.linalg.norm(seen[:, 2]) == pytest.approx(1.25 * width)
+
+    def test_steady_deep_shapes_count_however_complex(self) -> None:
+        _, rotations, found, deep = self.estimates(0.9)
+        steady = dataclasses.replace(deep, steadiness=1.0)
+        blend = with_deep_shapes(found, steady, rotations)
+        np.testing.assert_allclose(blend.shapes, deep.shapes, atol=1e-12)
+        assert blend.steadiness == 1.0
+
+    @pytest.mark.parametrize(("degrees", "kept"), [(20.0, 0.5), (37.5, 0.75), (60.0, 1.0)])
+    def test_depth_that_moves_more_than_the_tracks_is_taken_back(
+        self, degrees: float, kept: float
+    ) -> None:
+        """Half of it at a steadiness of -1/2, unless the camera turns."""
+        _, rotations, found, deep = self.estimates(0.9)
+        angles = np.linspace(0.0, np.radians(degrees), len(rotations))
+        few = so3.exp(angles[:, None] * np.array([0.0, 1.0, 0.0]))
+        seen = few @ found.shapes
+        doubt = dataclasses.replace(deep, steadiness=-0.5)
+        blend = few @ with_deep_shapes(found, doubt, few).shapes
+        np.testing.assert_allclose(blend[:, :2], seen[:, :2], atol=1e-12)
+        np.testing.assert_allclose(blend[:, 2], kept * seen[:, 2], atol=1e-12)
 
     def test_of_very_noisy_tracks_deep_shapes_say_nothing(self) -> None:
         _, rotations, found, deep = self.estimates(0.5)
@@ -533,6 +589,11 @@ class TestCredibleDepth:
         )
         np.testing.assert_allclose(after[:, :2], before[:, :2], atol=1e-12)
         np.testing.assert_allclose(after[:, 2], kept * before[:, 2], atol=1e-12)
+
+    def test_steady_depth_is_kept(self) -> None:
+        W, rotations, _ = sequence()
+        found = dataclasses.replace(low_rank_shapes(W, rotations), complexity=1.0, steadiness=1.0)
+        assert credible_depth(found, rotations) is found
 
     def test_depth_is_bounded(self) -> None:
         W, rotations, _ = sequence()
