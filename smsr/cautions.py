@@ -25,7 +25,7 @@ _LOST = 0.01
 _NOISY = 0.02
 _UNDECIDED = 10.0  # degrees
 _WEAK_DEPTH = 0.75
-_STEADY = 0.5
+_STEADY_ENOUGH = 0.5
 _LITTLE_ROTATION = math.radians(10.0)
 
 
@@ -139,7 +139,7 @@ def depth_cautions(complexity: float, steadiness: float) -> list[Caution]:
     steadiness : float
         See `smsr.shapes.steadiness`.
     """
-    if complexity <= _WEAK_DEPTH or steadiness > _STEADY:
+    if complexity <= _WEAK_DEPTH or steadiness > _STEADY_ENOUGH:
         return []
     return [
         Caution(

@@ -51,7 +51,8 @@ class ShapeEstimate:
     flicker : float
         See `flicker`; 0 where it was not measured.
     steadiness : float
-        See `steadiness`; 0 where it was not measured.
+        Of the likely shapes that take part in these, see `steadiness`, as far as it counted; 0
+        where it was not measured.
     rotations : ndarray of shape (T, 3, 3), optional
         The cameras, where they were adjusted with the shapes.
     """
@@ -654,7 +655,7 @@ def faded(value: float, limits: tuple[float, float]) -> float:
 
 
 LIKELY = (0.55, 0.75)
-"""Complexities between which the likely depths lose their part."""
+"""Complexities between which the likely depths lose their part, unless the shapes are steady."""
 
 _ROUGHLY = 5.0  # times the tolerance, for the start of a refinement
 _LITTLE = 0.25  # part of the depths below which refining it is not worth the time
@@ -739,7 +740,8 @@ def with_likely_depth(
         tolerance=_LIKELY_TOLERANCE,
         hook=hook,
     )
-    steady = steadiness(seen @ directions, likely.shapes)
+    turned = rotations if adjustment is None else adjustment.rotations()
+    steady = steadiness(likely.shapes, turned)
     part = max(part, steady) * certain
     part *= 1.0 - (1.0 - likely.support) * estimate.flicker / _MOST_BY_HASTE
     shapes, others, adjusted = estimate.shapes, likely.shapes, None
@@ -758,44 +760,49 @@ def with_likely_depth(
     )
 
 
-_STEADY = (1.0, 3.0)
-_UNSTEADY = (0.1, 0.25)
+_STEADY = (1.0, 3.0)  # ratios of second differences between which shapes become sure
+_UNSTEADY = (0.1, 0.25)  # products of both ratios between which they stop to be wrong
 
 
-def steadiness(measurements: NDArray[np.float64], shapes: NDArray[np.float64]) -> float:
+def steadiness(shapes: NDArray[np.float64], rotations: NDArray[np.float64]) -> float:
     """Return what the steadiness of the shapes says for them: 1 for sure, 0 nothing, -1 against.
 
-    A camera held in the hand shakes, and an object rarely does: where the second differences in
-    time of the tracks are much larger than those of the shapes, cameras and depths explain the
-    shake, which wrong ones cannot. Where shapes move and shake far more than the tracks, all of
-    that is motion along the viewing direction, which the tracks cannot have told.
+    A camera held in the hand shakes, and an object rarely does: where the tracks, and flat shapes,
+    have much larger second differences in time, depth explains the shake, which wrong depth cannot.
+    (Flat ones too, for they explain as much of a roll about the viewing direction.) Where the
+    product of the ratios of first and of second differences is far below 1, most of the motion is
+    that of the depths, which the tracks cannot have told.
 
     Parameters
     ----------
-    measurements : ndarray of shape (2T, N)
-        W.
     shapes : ndarray of shape (T, 3, N)
         S.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
     """
-    frames, tiny = len(shapes), np.finfo(float).tiny
+    seen = rotations[:, :2] @ shapes
+    flat = rotations[:, :2].transpose(0, 2, 1) @ seen
     ratios = []
     for order in (1, 2):
-        seen = np.diff(measurements.reshape(frames, -1), n=order, axis=0)
-        moved = np.diff(shapes.reshape(frames, -1), n=order, axis=0)
-        ratios.append(max(float((seen**2).sum()), tiny) / max(float((moved**2).sum()), tiny))
+        tracks, without, moved = (
+            float((np.diff(each, n=order, axis=0) ** 2).sum()) for each in (seen, flat, shapes)
+        )
+        least = min(tracks, without)
+        # Two frames have no second differences, and an object at rest has none either.
+        ratios.append(least / moved if moved > 0.0 else 1.0)
     motion, shake = ratios
     low, high = _STEADY
-    sure = min(max(math.log(shake / low) / math.log(high / low), 0.0), 1.0)
+    sure = min(math.log(max(shake, low) / low) / math.log(high / low), 1.0)
     return sure - faded(motion * shake, _UNSTEADY)
 
 
 DOUBTFUL = 0.6
 """Complexity above which the way into the problem decides on the depth."""
 
-_DEEP = (0.7, 0.85)  # complexities between which the deep shapes lose their part
+_DEEP = (0.7, 0.85)  # complexities between which unsteady deep shapes lose their part
 _DEEPEST_BY_WIDTH = 1.25
 _NOISIEST = 0.15  # part of the tracks' spread
-_FEW_VIEWS = (math.radians(30.0), math.radians(45.0))
+_FEW_VIEWS = (math.radians(30.0), math.radians(45.0))  # widest angles between viewing directions
 
 
 def _trust(noise: float) -> float:
@@ -825,8 +832,9 @@ def with_deep_shapes(
     noise : float
         As a part of the tracks' spread: the more there was, the less does simplicity say.
     """
-    part = max(faded(deep.complexity, _DEEP), deep.steadiness) * _trust(noise)
-    doubt = faded(spread_of_views(rotations), _FEW_VIEWS) * _trust(noise)
+    trust = _trust(noise)
+    part = max(faded(deep.complexity, _DEEP), deep.steadiness) * trust
+    doubt = faded(spread_of_views(rotations), _FEW_VIEWS) * trust
     keep = 1.0 + doubt * min(deep.steadiness, 0.0)
     if part == 0.0 and keep == 1.0:
         return estimate
@@ -841,11 +849,11 @@ def with_deep_shapes(
     change = keep * (present + part * (depths - present)) - present
     reason = f"{estimate.reason}; {part:.0%} of shapes with full depth: {deep.reason}"
     if keep < 1.0:
-        reason += f"; {keep:.0%} of the depth was kept, for it moves more than the tracks"
+        reason += f"; {keep:.0%} of the depth was kept, for likely depths move more than the tracks"
     return dataclasses.replace(
         estimate,
         shapes=estimate.shapes + axis[:, :, None] * change[:, None],
-        steadiness=deep.steadiness,
+        steadiness=deep.steadiness * trust,
         iterations=estimate.iterations + deep.iterations,
         converged=estimate.converged and deep.converged,
         reason=reason,
@@ -917,7 +925,7 @@ def credible_depth(estimate: ShapeEstimate, rotations: NDArray[np.float64]) -> S
     seen = rotations @ estimate.shapes
     depth, image = (seen[:, 2] ** 2).mean(), (seen[:, :2] ** 2).mean()
     ratio = math.sqrt(depth / max(image, np.finfo(float).tiny))
-    keep = max(faded(estimate.complexity, FLAT), estimate.steadiness)
+    keep = faded(estimate.complexity, FLAT)
     keep *= min(1.0, _DEEPEST / max(ratio, np.finfo(float).tiny))
     if keep == 1.0:
         return estimate

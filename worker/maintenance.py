@@ -71,7 +71,8 @@ class Maintenance:
                 part()
             except (RedisConnectionError, RedisTimeoutError) as error:
                 # All parts need Redis, and each would wait for it in turn.
-                log.warning("maintenance waits for Redis", part=part.__name__, reason=str(error))
+                reason = str(error)
+                log.warning("maintenance stops, Redis is away", part=part.__name__, reason=reason)
                 return
             except (RedisError, StorageError) as error:
                 log.warning("maintenance is put off", part=part.__name__, reason=str(error))

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from smsr.progress import StageHook
 
 RELAXATIONS = ((10, 1e-3), (3, 1e-3), (2, 1e-3), (10, 4e-3), (10, 1.6e-2))
-"""Basis size and trace weight of the relaxations that are tried; mostly the first is right."""
+"""Basis size and trace weight of the relaxations that are tried; mostly the first is right, with
+less weight where there is less noise, or lighter still."""
 
 _CLEAN_WEIGHT = 2.5e-4  # of the first relaxation
 _NOISY = 0.02  # noise, as a part of the tracks' spread, from which on its weight is the full one
@@ -36,17 +37,20 @@ _LIGHTER = (0.3, 0.1, 0.03)
 """Parts of the first weight that are tried as well, for as long as the shapes get simpler: a heavy
 trace makes cameras that turn little stand still, a light one fits noise."""
 
-_NOISIEST = 0.1
+_STILL = math.radians(3.0)
+"""Cameras that see less of the object than this say nothing of a lighter trace."""
+
+_TOO_NOISY = 0.1
 """Noise, as a part of the tracks' spread, from which on simple shapes tell nothing of the trace."""
 
 _CERTAIN = 0.3
-"""Complexity below which the first relaxation is right and no other is tried."""
+"""Complexity below which the first relaxation, or a lighter one, is right and no other is tried."""
 
 _CLEARLY_LOWER = 0.93
-"""Part of the first complexity that another relaxation has to stay below to be taken."""
+"""Part of the first complexity that the others, but for lighter ones, must stay below."""
 
 _CREDIBLE = 0.75
-"""Complexity above which another relaxation is taken only if the first one failed grossly (1)."""
+"""Complexity above which those are taken only if the first one failed grossly (1)."""
 
 _AGREEMENT = math.radians(6.0)
 _AS_GOOD = 1.05  # relaxations of complexities within this factor are equally likely
@@ -85,20 +89,25 @@ def free_cameras(
     -------
     CameraEstimate
         Its criteria are ``complexity``, see there, and ``disagreement``, the largest root mean
-        square angle in degrees to the cameras of a relaxation that is nearly as good.
+        square angle in degrees to the cameras of a relaxation that is nearly as good, 0 where the
+        shapes are so simple that the cameras are certain.
     """
     most = max(1, len(values) // 3)
     share = min(noise / _NOISY, 1.0) ** 2
-    first = (RELAXATIONS[0][0], max(_CLEAN_WEIGHT, RELAXATIONS[0][1] * share))
-    tried = (first, *((first[0], part * first[1]) for part in _LIGHTER), *RELAXATIONS[1:])
-    settings = list(dict.fromkeys((min(K, most), weight) for K, weight in tried))
+    (size, full), *rest = ((min(K, most), weight) for K, weight in RELAXATIONS)
+    weights = [max(_CLEAN_WEIGHT, full * share)]
     if basis_size is not None:
-        settings = [(basis_size, RELAXATIONS[0][1])]
-    largest = usable_rank(values, 3 * max(K for K, _ in settings))
+        size, weights, rest = basis_size, [full], []
+    elif noise < _TOO_NOISY:
+        weights += [part * weights[0] for part in _LIGHTER]
+    ladder = [(size, weight) for weight in weights]
+    others = [setting for setting in dict.fromkeys(rest) if setting not in ladder]
+    largest = usable_rank(values, 3 * size)
     form = orthonormality_form(scaled_motion(left, values, largest), unit_scale=True)
+    found: list[_Relaxation] = []
 
-    def relax(index: int) -> _Relaxation:
-        K, weight = settings[index]
+    def relax(K: int, weight: float) -> _Relaxation:
+        count = len(ladder) + len(others)
         estimate = relaxed_cameras(
             left,
             values,
@@ -107,46 +116,44 @@ def free_cameras(
             form=form,
             max_iterations=max_iterations,
             tolerance=tolerance,
-            hook=part_of(hook, index / len(settings), (index + 1) / len(settings)),
+            hook=part_of(hook, len(found) / count, (len(found) + 1) / count),
         )
         reason = f"relaxation with K = {K} and trace weight {weight:g}: {estimate.reason}"
-        return _Relaxation(
-            dataclasses.replace(estimate, reason=reason),
-            complexity(left * values, estimate.rotations),
-        )
+        estimate = dataclasses.replace(estimate, reason=reason)
+        found.append(_Relaxation(K, estimate, complexity(left * values, estimate.rotations)))
+        return found[-1]
 
-    plain = best = relax(0)
-    found = [plain]
-    lighter, others = range(1, 1 + len(_LIGHTER)), range(1 + len(_LIGHTER), len(settings))
-    if basis_size is None and noise < _NOISIEST:
-        for index in lighter:
-            found.append(relax(index))
-            if found[-1].complexity >= best.complexity:
-                break
-            best = found[-1]
-    if basis_size is None and best.complexity >= _CERTAIN:
-        for index in others:
-            other = relax(index)
-            found.append(other)
-            if _is_clearly_simpler(other, plain) and other.complexity < best.complexity:
-                best = other
-            if index == others[0] and _agree(plain, other):
-                break
+    first = best = relax(*ladder[0])
+    for setting in ladder[1:]:
+        lighter = relax(*setting)
+        if lighter.complexity < best.complexity and lighter.estimate.converged:
+            best = lighter
+        elif so3.spread_of_views(lighter.estimate.rotations) > _STILL:
+            break
+    doubtful = best.complexity >= _CERTAIN
+    for setting in others if doubtful else []:
+        other = relax(*setting)
+        if _is_clearly_simpler(other, first) and other.complexity < best.complexity:
+            best = other
+        if setting == others[0] and _agree(first, other):
+            break
     angles = [
         angle_between(best.estimate.rotations, other.estimate.rotations)
         for other in found
-        if other.complexity <= _AS_GOOD * best.complexity
+        if doubtful and other.complexity <= _AS_GOOD * best.complexity
     ]
+    disagreement = math.degrees(max(angles, default=0.0))
     return dataclasses.replace(
         best.estimate,
-        criteria={"complexity": best.complexity, "disagreement": math.degrees(max(angles))},
+        criteria={"complexity": best.complexity, "disagreement": disagreement},
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relaxation:
-    """Cameras, and the complexity of the shapes they give."""
+    """Cameras found with at most K column triplets, and the complexity of the shapes they give."""
 
+    basis_size: int
     estimate: CameraEstimate
     complexity: float
 
@@ -156,13 +163,15 @@ def _agree(first: _Relaxation, second: _Relaxation) -> bool:
 
     They fail grossly in different ways, so then neither has failed.
     """
-    if first.complexity >= _CREDIBLE or second.complexity < _CLEARLY_LOWER * first.complexity:
+    if first.basis_size == second.basis_size or first.complexity >= _CREDIBLE:
+        return False
+    if second.complexity < _CLEARLY_LOWER * first.complexity:
         return False
     return angle_between(first.estimate.rotations, second.estimate.rotations) < _AGREEMENT
 
 
 def _is_clearly_simpler(other: _Relaxation, first: _Relaxation) -> bool:
-    """Tell whether a relaxation gives so much simpler shapes than the first that that failed."""
+    """Tell whether a relaxation gives so much simpler shapes that the first has failed."""
     clear = other.complexity < _CLEARLY_LOWER * first.complexity
     return clear and (other.complexity < _CREDIBLE or first.complexity > 1.0)
 

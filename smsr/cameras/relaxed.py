@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from smsr.progress import StageHook
 
 _RELAXATION = 1.6
-_BALANCE_EVERY, _BALANCE, _MOST_CHANGE = 25, 2.0, 5.0
-_LEAST_PENALTY = 5e-4  # down to it the penalty is the weight of the trace
+_LIGHT = 5e-4  # weight of the trace below which the penalty is its geometric mean with this
+_BALANCE_EVERY = 25
+_BALANCE = 2.0  # change of the penalty, the root of the ratio of the residuals, that is worth it
+_MOST_CHANGE = 5.0
 
 
 def relaxed_cameras(
@@ -95,11 +97,12 @@ def relaxed_factor(
 ) -> tuple[NDArray[np.float64], tuple[float, ...]]:
     """Solve the convex problem of `relaxed_cameras` for F.
 
-    The splitting F = Z gives a linear system with one and the same matrix in every iteration and
-    an eigenvalue thresholding. The penalty equal to the weight of the trace thresholds eigenvalues
-    at 1, the size that F has for cameras of unit scale, and converges in some tens of iterations
-    where accelerated gradient steps need a thousand; a light trace needs a larger one. Where one of
-    the two residuals runs ahead of the other all the same, it is changed (residual balancing).
+    The splitting F = Z gives a linear system with one and the same matrix between changes of the
+    penalty and an eigenvalue thresholding. The penalty equal to the weight of the trace thresholds
+    eigenvalues at 1, the size that F has for cameras of unit scale, and converges in some tens of
+    iterations where accelerated gradient steps need a thousand; a light trace needs a larger one.
+    Where one of the residuals runs ahead of the other all the same, it is changed (residual
+    balancing).
 
     Parameters
     ----------
@@ -120,7 +123,7 @@ def relaxed_factor(
         form = orthonormality_form(motion, unit_scale=True)
     form = form.leading(n)
     H, b = form.hessian / frames, form.linear / frames
-    penalty = max(trace_weight, math.sqrt(trace_weight * _LEAST_PENALTY))
+    penalty = max(trace_weight, math.sqrt(trace_weight * _LIGHT))
     system = cho_factor(H + penalty * np.eye(len(H)), check_finite=False)
     z = symmetric_vector(np.diag((np.arange(n) < 3).astype(np.float64)))
     u = np.zeros_like(z)

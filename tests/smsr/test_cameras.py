@@ -246,24 +246,35 @@ class TestFree:
             assert chosen.criteria["disagreement"] >= 0.0
             assert_cameras(chosen.rotations)
 
-    @pytest.mark.parametrize(("noise", "first"), [(0.0, 2.5e-4), (0.01, 2.5e-4), (0.5, 1e-3)])
-    def test_the_less_noise_the_less_weight_of_the_trace(self, noise: float, first: float) -> None:
+    @pytest.mark.parametrize(
+        ("noise", "weights"),
+        [
+            (0.0, [2.5e-4, 7.5e-5, 2.5e-5, 7.5e-6]),
+            (0.015, [5.625e-4, 1.6875e-4, 5.625e-5, 1.6875e-5]),
+            (0.5, [1e-3]),
+        ],
+    )
+    def test_the_less_noise_the_less_weight_of_the_trace(
+        self, noise: float, weights: list[float]
+    ) -> None:
         left, values = low_rank(swing(), modes=1)
         weight = self.weight(free_cameras(left, values, noise=noise))
-        assert any(weight == pytest.approx(part * first) for part in (1.0, 0.3, 0.1, 0.03))
+        assert any(weight == pytest.approx(each, rel=1e-4) for each in weights)
 
     @staticmethod
     def weight(found: CameraEstimate) -> float:
         return float(found.reason.partition("trace weight ")[2].partition(":")[0])
 
-    def test_a_lighter_trace_lets_cameras_turn_that_turn_little(self) -> None:
-        W, true, _ = shaken_tracks()
+    @pytest.mark.parametrize("seed", range(6))
+    def test_a_lighter_trace_lets_cameras_turn_that_turn_little(self, seed: int) -> None:
+        """Also where the second weight leaves them as still as the first."""
+        W, true, _ = shaken_tracks(seed=seed)
         left, values, _ = np.linalg.svd(W, full_matrices=False)
         left, values = left[:, :9], values[:9] / values[0]
         first = relaxed_cameras(left, values, basis_size=3, trace_weight=2.5e-4)
         found = free_cameras(left, values)
-        assert so3.spread_of_views(first.rotations) < 0.01 < 0.15 < so3.spread_of_views(true)
-        assert so3.spread_of_views(found.rotations) > 0.15
+        assert so3.spread_of_views(first.rotations) < 0.01 < 0.1 < so3.spread_of_views(true)
+        assert so3.spread_of_views(found.rotations) > 0.1
         assert self.weight(found) < 1e-4
         assert found.criteria["complexity"] < complexity(left * values, first.rotations)
 

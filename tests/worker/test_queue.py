@@ -211,7 +211,7 @@ def test_maintenance_waits_for_redis_once(queue: JobQueue, redis_process: RedisP
             keeper.run_once()
     finally:
         redis_process.start()
-    assert [line["event"] for line in lines] == ["maintenance waits for Redis"]
+    assert [line["event"] for line in lines] == ["maintenance stops, Redis is away"]
     assert last_maintenance(queue.redis) is None
     keeper.run_once()
     assert last_maintenance(queue.redis) is not None
