@@ -38,7 +38,8 @@ _LIGHTER = (0.3, 0.1, 0.03)
 trace makes cameras that turn little stand still, a light one fits noise."""
 
 _STILL = math.radians(3.0)
-"""Cameras that see less of the object than this say nothing of a lighter trace."""
+"""Cameras whose viewing directions spread less than this stand still, and a trace lighter than that
+which holds them may yet let them turn."""
 
 _TOO_NOISY = 0.1
 """Noise, as a part of the tracks' spread, from which on simple shapes tell nothing of the trace."""
