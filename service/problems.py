@@ -23,6 +23,7 @@ from service.requests import REQUEST_ID, request_id
 from service.security import protect
 from smsr import errors
 from worker import problems as worker_problems
+from worker.connections import UNREACHABLE
 from worker.problems import InternalError, StorageUnavailable
 from worker.records import TooManyBytes, TooManyJobs
 from worker.storage import ObjectMissing, StorageError, StorageFull
@@ -788,8 +789,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_invalid_request)
     app.add_exception_handler(HTTPException, _on_http_error)
     for away in (
-        redis.exceptions.ConnectionError,
-        redis.exceptions.TimeoutError,
+        *UNREACHABLE,
         redis.exceptions.ReadOnlyError,
         redis.exceptions.OutOfMemoryError,
     ):

@@ -740,15 +740,15 @@ def with_likely_depth(
         tolerance=_LIKELY_TOLERANCE,
         hook=hook,
     )
-    turned = rotations if adjustment is None else adjustment.rotations()
-    steady = steadiness(likely.shapes, turned)
+    likely_cameras = rotations if adjustment is None else adjustment.rotations()
+    steady = steadiness(likely.shapes, likely_cameras)
     part = max(part, steady) * certain
     part *= 1.0 - (1.0 - likely.support) * estimate.flicker / _MOST_BY_HASTE
     shapes, others, adjusted = estimate.shapes, likely.shapes, None
     if adjustment is not None:
         adjusted = adjustment.rotations(part)
         shapes, some = (turned_to(each, rotations, adjusted) for each in (shapes, some))
-        others = turned_to(others, adjustment.rotations(), adjusted)
+        others = turned_to(others, likely_cameras, adjusted)
     return dataclasses.replace(
         estimate,
         shapes=shapes + part * (others - some) @ directions.T,
@@ -781,7 +781,7 @@ def steadiness(shapes: NDArray[np.float64], rotations: NDArray[np.float64]) -> f
         Cameras completed by the viewing direction.
     """
     seen = rotations[:, :2] @ shapes
-    flat = rotations[:, :2].transpose(0, 2, 1) @ seen
+    flat = planar_shapes(seen.reshape(-1, seen.shape[2]), rotations)
     ratios = []
     for order in (1, 2):
         tracks, without, moved = (

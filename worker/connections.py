@@ -15,6 +15,9 @@ BRIEF_RETRIES = 3
 PATIENT_RETRIES = 30
 """With pauses of up to a second: half a minute, enough for Redis to start again."""
 
+UNREACHABLE = (redis.ConnectionError, redis.TimeoutError)
+"""What a command raises in the end where Redis cannot be reached."""
+
 
 def _backoff() -> ExponentialWithJitterBackoff:
     return ExponentialWithJitterBackoff(base=0.05, cap=1.0)

@@ -10,10 +10,9 @@ import time
 from typing import TYPE_CHECKING, cast
 
 import structlog
-from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import RedisError
-from redis.exceptions import TimeoutError as RedisTimeoutError
 
+from worker.connections import UNREACHABLE
 from worker.records import PREFIX
 from worker.storage import StorageError
 from worker.uploads import UploadStore, folder_prefix
@@ -69,7 +68,7 @@ class Maintenance:
         ):
             try:
                 part()
-            except (RedisConnectionError, RedisTimeoutError) as error:
+            except UNREACHABLE as error:
                 # All parts need Redis, and each would wait for it in turn.
                 reason = str(error)
                 log.warning("maintenance stops, Redis is away", part=part.__name__, reason=reason)

@@ -105,6 +105,7 @@ def free_cameras(
     others = [setting for setting in dict.fromkeys(rest) if setting not in ladder]
     largest = usable_rank(values, 3 * size)
     form = orthonormality_form(scaled_motion(left, values, largest), unit_scale=True)
+    measurements = left * values
     found: list[_Relaxation] = []
 
     def relax(K: int, weight: float) -> _Relaxation:
@@ -121,7 +122,7 @@ def free_cameras(
         )
         reason = f"relaxation with K = {K} and trace weight {weight:g}: {estimate.reason}"
         estimate = dataclasses.replace(estimate, reason=reason)
-        found.append(_Relaxation(K, estimate, complexity(left * values, estimate.rotations)))
+        found.append(_Relaxation(estimate, complexity(measurements, estimate.rotations)))
         return found[-1]
 
     first = best = relax(*ladder[0])
@@ -132,11 +133,11 @@ def free_cameras(
         elif so3.spread_of_views(lighter.estimate.rotations) > _STILL:
             break
     doubtful = best.complexity >= _CERTAIN
-    for setting in others if doubtful else []:
-        other = relax(*setting)
+    for K, weight in others if doubtful else []:
+        other = relax(K, weight)
         if _is_clearly_simpler(other, first) and other.complexity < best.complexity:
             best = other
-        if setting == others[0] and _agree(first, other):
+        if (K, weight) == others[0] and size != K and _agree(first, other):
             break
     angles = [
         angle_between(best.estimate.rotations, other.estimate.rotations)
@@ -152,9 +153,8 @@ def free_cameras(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relaxation:
-    """Cameras found with at most K column triplets, and the complexity of the shapes they give."""
+    """Cameras, and the complexity of the shapes they give."""
 
-    basis_size: int
     estimate: CameraEstimate
     complexity: float
 
@@ -164,9 +164,7 @@ def _agree(first: _Relaxation, second: _Relaxation) -> bool:
 
     They fail grossly in different ways, so then neither has failed.
     """
-    if first.basis_size == second.basis_size or first.complexity >= _CREDIBLE:
-        return False
-    if second.complexity < _CLEARLY_LOWER * first.complexity:
+    if first.complexity >= _CREDIBLE or second.complexity < _CLEARLY_LOWER * first.complexity:
         return False
     return angle_between(first.estimate.rotations, second.estimate.rotations) < _AGREEMENT
 

@@ -28,7 +28,7 @@ from smsr.cameras.selection import part_outside_span, with_simple_path, with_uni
 from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
 from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
-from tests.shaken import shaken as shaken_tracks
+from tests.shaken import shaken
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -268,7 +268,7 @@ class TestFree:
     @pytest.mark.parametrize("seed", range(6))
     def test_a_lighter_trace_lets_cameras_turn_that_turn_little(self, seed: int) -> None:
         """Also where the second weight leaves them as still as the first."""
-        W, true, _ = shaken_tracks(seed=seed)
+        W, true, _ = shaken(seed=seed)
         left, values, _ = np.linalg.svd(W, full_matrices=False)
         left, values = left[:, :9], values[:9] / values[0]
         first = relaxed_cameras(left, values, basis_size=3, trace_weight=2.5e-4)
@@ -279,7 +279,7 @@ class TestFree:
         assert found.criteria["complexity"] < complexity(left * values, first.rotations)
 
     def test_of_very_noisy_tracks_no_lighter_trace_is_tried(self) -> None:
-        W, _, _ = shaken_tracks()
+        W, _, _ = shaken()
         left, values, _ = np.linalg.svd(W, full_matrices=False)
         found = free_cameras(left[:, :9], values[:9] / values[0], noise=0.1)
         assert self.weight(found) >= 1e-3
@@ -296,8 +296,8 @@ class TestFree:
         turn = Rotation.random(random_state=1).as_matrix()
         for same in (G @ turn, so3.mirror(G) @ turn):
             assert angle_between(G, same) == pytest.approx(0.0, abs=1e-6)
-        shaken = so3.exp(0.1 * np.random.default_rng(0).standard_normal((60, 3))) @ G
-        assert angle_between(G, shaken) == pytest.approx(0.1 * np.sqrt(3.0), rel=0.2)
+        trembling = so3.exp(0.1 * np.random.default_rng(0).standard_normal((60, 3))) @ G
+        assert angle_between(G, trembling) == pytest.approx(0.1 * np.sqrt(3.0), rel=0.2)
 
 
 class TestRigid:
@@ -353,8 +353,8 @@ class TestTurn:
         left, values = low_rank(true, modes=2)
         turn = fit_uniform_turn(true)
         shake = np.radians(1.0) * np.random.default_rng(0).standard_normal((60, 3))
-        for shaken in (np.zeros((60, 3)), shake):
-            exact = dataclasses.replace(turn, shake=shaken)
+        for each in (np.zeros((60, 3)), shake):
+            exact = dataclasses.replace(turn, shake=each)
             left, values = low_rank(exact.rotations, modes=2)
             off = dataclasses.replace(
                 exact, velocity=turn.velocity + np.radians([0.05, 0.1, -0.05])
