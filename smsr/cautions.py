@@ -26,6 +26,7 @@ _NOISY = 0.02
 _UNDECIDED = 10.0  # degrees
 _WEAK_DEPTH = 0.75
 _STEADY_ENOUGH = 0.5
+_GROWING = 1.25
 _LITTLE_ROTATION = math.radians(10.0)
 
 
@@ -147,6 +148,20 @@ def depth_cautions(complexity: float, steadiness: float) -> list[Caution]:
             f"With depth the shapes are only {max(0.0, 1.0 - complexity):.0%} simpler than the "
             "flat tracks, so the tracks say little about depth. It was reduced where they say "
             "nothing.",
+        )
+    ]
+
+
+def size_cautions(growth: float) -> list[Caution]:
+    """Judge by what factor the object grows, see `smsr.scales.growth`."""
+    if growth <= _GROWING:
+        return []
+    return [
+        Caution(
+            "size-changes",
+            f"Distances between points grow or shrink together, by a factor of {growth:.2g}. If "
+            "the object came nearer or went away, or the camera zoomed, take "
+            "camera_scale='varying'.",
         )
     ]
 

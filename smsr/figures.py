@@ -114,7 +114,8 @@ class FigureSource:
     @cached_property
     def rotations(self) -> NDArray[np.float64]:
         """Rotations (T, 3, 3) to x right, y up, z towards the viewer."""
-        cameras = np.asarray(self.cameras, np.float64).copy()
+        cameras = np.asarray(self.cameras, np.float64)
+        cameras = cameras / np.linalg.norm(cameras, axis=2, keepdims=True)
         if self.down:
             cameras[:, 1] *= -1.0
         depth = np.cross(cameras[:, 0], cameras[:, 1])

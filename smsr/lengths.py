@@ -157,7 +157,7 @@ def _biweight(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return weights
 
 
-def chosen_points(trajectories: NDArray[np.float64]) -> NDArray[np.intp]:
+def chosen_points(trajectories: NDArray[np.float64], most: int = MOST_POINTS) -> NDArray[np.intp]:
     """Return numbers of some points, all where they are few.
 
     They are taken evenly from all, sorted by their distance from the mean, so that the order of the
@@ -167,10 +167,12 @@ def chosen_points(trajectories: NDArray[np.float64]) -> NDArray[np.intp]:
     ----------
     trajectories : ndarray of shape (2T, n)
         Of points, less the mean.
+    most : int
+        Fewer are taken of long sequences.
     """
     frames, points = len(trajectories) // 2, trajectories.shape[1]
-    most = int((1.0 + np.sqrt(1.0 + 8.0 * _MOST_SQUARES / frames)) / 2.0)
-    count = min(points, MOST_POINTS, most)
+    affordable = int((1.0 + np.sqrt(1.0 + 8.0 * _MOST_SQUARES / frames)) / 2.0)
+    count = min(points, most, affordable)
     squares = np.einsum("tn,tn->n", trajectories, trajectories)
     order = np.argsort(squares, kind="stable")
     return np.sort(order[np.linspace(0, points - 1, count).astype(np.intp)])

@@ -27,7 +27,7 @@ class Lifting:
     inner : ndarray of shape (q, 2T)
         C.
     cameras : ndarray of shape (T, 2, 3) or None
-        R of the second term; None where the map has no such term.
+        R of the second term, over the scale of the camera; None where the map has no such term.
     """
 
     outer: NDArray[np.float64]
@@ -47,6 +47,14 @@ class Lifting:
         if self.cameras is not None:
             shapes += self.cameras.transpose(0, 2, 1) @ measurements.reshape(frames, 2, -1)
         return shapes
+
+    def after_division(self, scales: NDArray[np.float64]) -> Lifting:
+        """Return the map that divides each frame of the measurements by its scale (T,) first."""
+        return Lifting(
+            outer=self.outer,
+            inner=self.inner / np.repeat(scales, 2),
+            cameras=None if self.cameras is None else self.cameras / scales[:, None, None],
+        )
 
     def matrix(self) -> NDArray[np.float64]:
         """Return A (3T, 2T) itself, for small T."""

@@ -1,7 +1,8 @@
 """Errors of a reconstruction against ground truth: e3D and its relatives.
 
 Ground truth and shapes are centred in each frame and aligned by one orthogonal matrix for the
-whole sequence, reflections allowed, scale never. Everything is computed in double precision by
+whole sequence, reflections allowed. A scale is fitted only where cameras of varying scale leave the
+size of the object open. Everything is computed in double precision by
 chunks of points, so single-precision arrays of millions of points are read through their memory
 maps and never copied whole.
 """
@@ -67,7 +68,10 @@ class Evaluation:
     frame : {"camera", "object"}
         Which shapes were compared, ``R3_t S_t`` or ``S_t``.
     alignment : ndarray of shape (3, 3), float64, read-only
-        Orthogonal Q that carries the centred shapes onto the centred truth, ``G_tj ~ Q X_tj``.
+        Orthogonal Q that carries the centred shapes onto the centred truth, ``G_tj ~ c Q X_tj``.
+    scale : float
+        The factor c on all shapes: 1, but for cameras of varying scale, which tell no absolute
+        size. It is the best one then, for the sequence as a whole.
     """
 
     e3d: float
@@ -77,6 +81,7 @@ class Evaluation:
     relative_rms: float
     frame: Literal["camera", "object"]
     alignment: NDArray[np.float64]
+    scale: float = 1.0
 
     def __post_init__(self) -> None:
         self.alignment.flags.writeable = False
@@ -134,14 +139,15 @@ def evaluate(
     truth = as_shapes(ground_truth, frames, points)
 
     moments = _moments(truth, shapes)
-    chosen = _detect_frame(moments, reconstruction.cameras) if frame == "auto" else frame
-    turns = (
-        np.broadcast_to(np.eye(3), (frames, 3, 3))
-        if chosen == "object"
-        else reconstruction.rotations.astype(np.float64)
-    )
+    rotations = reconstruction.rotations.astype(np.float64)
+    chosen = _detect_frame(moments, rotations[:, :2]) if frame == "auto" else frame
+    turns = np.broadcast_to(np.eye(3), (frames, 3, 3)) if chosen == "object" else rotations
     cross = moments.cross @ turns.transpose(0, 2, 1)
     alignment = orthogonal_factor(cross.sum(axis=0))
+    scale = 1.0
+    if (reconstruction.scales != 1.0).any():
+        size = max(float(np.einsum("tii->", moments.shape)), np.finfo(float).tiny)
+        scale = float(np.einsum("ij,tij->", alignment, cross)) / size
     per_frame_alignment = orthogonal_factor(cross)
 
     deviations = np.sqrt(np.einsum("tii->ti", moments.truth) / points)
@@ -151,7 +157,10 @@ def evaluate(
             "All true points coincide in every frame, so no error can be measured against them."
         )
     distances, free_distances = _distances(
-        truth, shapes, moments, [alignment @ turns, per_frame_alignment @ turns]
+        truth,
+        shapes,
+        moments,
+        [scale * (alignment @ turns), scale * (per_frame_alignment @ turns)],
     )
     per_frame = distances.sums / (sigma * points)
     extent = np.sqrt(np.einsum("tii->t", moments.truth))
@@ -164,6 +173,7 @@ def evaluate(
         relative_rms=float((np.sqrt(distances.squares[seen]) / extent[seen]).mean()),
         frame=chosen,
         alignment=alignment,
+        scale=scale,
     )
 
 
@@ -334,11 +344,8 @@ def _distances(
     return totals
 
 
-def _detect_frame(
-    moments: _Moments, cameras: NDArray[np.floating[Any]]
-) -> Literal["camera", "object"]:
+def _detect_frame(moments: _Moments, R: NDArray[np.float64]) -> Literal["camera", "object"]:
     """Say whether one fixed camera explains the images of the ground truth."""
-    R = cameras.astype(np.float64)
     image = np.einsum("tij,tjk,tik->", R, moments.shape, R)  # sum of ||R_t x||^2
     cross = R @ moments.cross.transpose(0, 2, 1)  # sum of (R_t x) g^T
     free = image - np.sum(_explained(cross, moments.truth))

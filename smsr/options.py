@@ -90,6 +90,12 @@ class Options:
         "the relaxed cameras, less the drift that points at rest show, or a simple path of the "
         "camera where that explains them; for a rigid object they come from its factorisation.",
     )
+    camera_scale: Literal["constant", "varying"] = option(
+        "constant",
+        "Whether the camera keeps its scale: 'constant' is an orthographic camera, and objects may "
+        "grow; 'varying' is for an object that comes nearer or goes away, or a lens that zooms: "
+        "the scale of each frame is found from distances between points, which should keep.",
+    )
     basis_size: int | None = option(
         None,
         "Number K of basis shapes in the camera stage; null has several tried.",

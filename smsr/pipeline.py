@@ -13,6 +13,7 @@ import math
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,17 +26,20 @@ from smsr.cautions import (
     depth_cautions,
     gap_cautions,
     input_cautions,
+    size_cautions,
 )
 from smsr.completion import completed
 from smsr.errors import Cancelled
+from smsr.lengths import chosen_points
 from smsr.lifting import denoised_lifting, exact_lifting, smoothed_lifting
 from smsr.measurements import as_source
-from smsr.noise import virtual_points
 from smsr.options import Options, parse, resolve
-from smsr.progress import Progress
+from smsr.progress import Progress, part_of
+from smsr.reduction import Reduction
 from smsr.result import Diagnostics, Reconstruction, StageReport
 from smsr.rotations import angles_between
 from smsr.rowspace import factorise, map_back
+from smsr.scales import growth, varying_scales
 from smsr.shapes import basis_size_of, estimate_shapes
 from smsr.streaming import one_blas_thread
 from smsr.trajectories import smooth_trajectories
@@ -53,14 +57,17 @@ if TYPE_CHECKING:
     from smsr.progress import ProgressCallback, StageHook
     from smsr.result import Caution
     from smsr.rowspace import RowSpace
+    from smsr.scales import ScaleEstimate
     from smsr.shapes import ShapeEstimate
     from smsr.trajectories import SmoothMotion
 
-STAGES = ("reading", "factorising", "cameras", "smoothing", "shapes", "writing")
+STAGES = ("reading", "factorising", "scales", "cameras", "smoothing", "shapes", "writing")
 """Names of the stages, in order."""
 
-_SHARES = dict(zip(STAGES, (0.02, 0.23, 0.25, 0.05, 0.20, 0.25), strict=True))
+_SHARES = dict(zip(STAGES, (0.02, 0.18, 0.10, 0.22, 0.05, 0.18, 0.25), strict=True))
 """Part of the progress bar that each stage moves."""
+
+_GROWTH_FRAMES, _GROWTH_POINTS = 100, 24  # of which growth is told
 
 _LISTED_RESIDUALS = 500
 _LISTED_SINGULAR_VALUES = 100
@@ -168,40 +175,37 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     clock : _Clock
         Receives the reports of the stages.
     """
-    points = virtual_points(space.left, space.singular_values, space.points, options.noise).leading(
-        options.virtual_points
+    with clock.stage("scales") as hook:
+        if options.camera_scale == "constant":
+            scaling = None
+        else:
+            scaling = varying_scales(space, options, partial(_sampled_shapes, options), hook)
+            clock.note(scaling)
+    if scaling is None:
+        return _solve(space, options, clock)
+    solution = _solve(space.divided(scaling.scales), options, clock)
+    return dataclasses.replace(
+        solution,
+        cameras=scaling.scales[:, None, None] * solution.cameras,
+        lifting=solution.lifting.after_division(scaling.scales),
     )
-    # Penalties have a fixed scale, so solve for measurements of unit spectral norm.
-    unit = float(points.values[0])
-    values = points.values / unit
-    virtual = points.left * values
-    noise = points.noise / space.spread
+
+
+def _solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
+    """Find cameras of one scale, and shapes."""
+    reduction = Reduction.of(space, options)
+    measurements = reduction.measurements
     with clock.stage("cameras") as hook:
-        real = points.coordinates @ space.sample
-        estimate = fix_gauge(
-            estimate_cameras(points.left, values, options, hook, points=real, noise=noise)
-        )
+        estimate = _cameras(reduction, options, hook)
         rotations = estimate.rotations
         clock.note(estimate)
     with clock.stage("smoothing") as hook:
-        motion = _smooth(virtual, rotations, estimate.basis_size, options, hook)
+        motion = _smooth(measurements, rotations, estimate.basis_size, options, hook)
         if motion is not None:
-            virtual = motion.apply(virtual)
+            measurements = motion.apply(measurements)
             clock.note(motion)
     with clock.stage("shapes") as hook:
-        found = estimate_shapes(
-            virtual,
-            rotations,
-            options,
-            camera_model=estimate.model,
-            coherent=estimate.coherent,
-            simpler=estimate.simpler,
-            simpler_share=estimate.simpler_share,
-            adjustable=estimate.adjustable,
-            noise=noise,
-            points=real,
-            hook=hook,
-        )
+        found = _shapes(measurements, estimate, reduction, options, hook)
         clock.note(found)
         reason = estimate.reason
         if found.rotations is not None:
@@ -209,12 +213,13 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             reason += f"; adjusted with the depths, by up to {degrees:.1f} degrees"
             rotations = found.rotations
     cameras = np.ascontiguousarray(rotations[:, :2])
+    points, left, values = reduction.points, reduction.left, reduction.values
     if points.noise > 0.0:
-        lifting = denoised_lifting(found.shapes * unit, points.coordinates)
+        lifting = denoised_lifting(found.shapes * reduction.unit, points.coordinates)
     elif motion is None:
-        lifting = exact_lifting(found.shapes, cameras, points.left, values)
+        lifting = exact_lifting(found.shapes, cameras, left, values)
     else:
-        lifting = smoothed_lifting(found.shapes, cameras, points.left, values, motion.basis)
+        lifting = smoothed_lifting(found.shapes, cameras, left, values, motion.basis)
     published = estimate.model == "paper"
     return Solution(
         cameras=cameras,
@@ -228,9 +233,67 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             *input_cautions(space.singular_values, points, space.points),
             *camera_cautions(rotations, estimate),
             *depth_cautions(found.complexity, found.steadiness),
+            *size_cautions(_growth(found.shapes, reduction, space, options)),
             *convergence_cautions(clock.reports),
         ),
     )
+
+
+def _cameras(reduction: Reduction, options: Options, hook: StageHook) -> CameraEstimate:
+    """Find the cameras, in the frame of the middle one."""
+    return fix_gauge(
+        estimate_cameras(
+            reduction.left,
+            reduction.values,
+            options,
+            hook,
+            points=reduction.sample,
+            noise=reduction.noise,
+        )
+    )
+
+
+def _shapes(
+    measurements: NDArray[np.float64],
+    estimate: CameraEstimate,
+    reduction: Reduction,
+    options: Options,
+    hook: StageHook,
+) -> ShapeEstimate:
+    """Find the shapes of the virtual points, which may have been smoothed."""
+    return estimate_shapes(
+        measurements,
+        estimate.rotations,
+        options,
+        camera_model=estimate.model,
+        coherent=estimate.coherent,
+        simpler=estimate.simpler,
+        simpler_share=estimate.simpler_share,
+        adjustable=estimate.adjustable,
+        noise=reduction.noise,
+        points=reduction.sample,
+        hook=hook,
+    )
+
+
+def _growth(
+    shapes: NDArray[np.float64], reduction: Reduction, space: RowSpace, options: Options
+) -> float:
+    """Return by what factor some points grow in some frames, 1 where the camera did it."""
+    if options.camera_scale == "varying":
+        return 1.0
+    step = math.ceil(space.frames / _GROWTH_FRAMES)
+    chosen = chosen_points(space.sample, _GROWTH_POINTS)
+    return growth(shapes[::step] @ reduction.sample[:, chosen])
+
+
+def _sampled_shapes(options: Options, space: RowSpace, hook: StageHook) -> NDArray[np.float64]:
+    """Return shapes (T, 3, s) of the sample of points."""
+    reduction = Reduction.of(space, options)
+    estimate = _cameras(reduction, options, part_of(hook, 0.0, 0.5))
+    found = _shapes(reduction.measurements, estimate, reduction, options, part_of(hook, 0.5, 1.0))
+    sampled: NDArray[np.float64] = found.shapes @ reduction.sample
+    return sampled
 
 
 def _smooth(
@@ -280,7 +343,7 @@ class _Clock:
         last = self.reports[-1]
         hook(1.0, last.iterations, last.residuals[-1] if last.residuals else None)
 
-    def note(self, outcome: CameraEstimate | SmoothMotion | ShapeEstimate) -> None:
+    def note(self, outcome: ScaleEstimate | CameraEstimate | SmoothMotion | ShapeEstimate) -> None:
         """Add what the present stage did."""
         step = -(-len(outcome.residuals) // _LISTED_RESIDUALS) or 1
         self.reports[-1] = dataclasses.replace(

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from smsr.options import Options
 
 
+_SAME_SCALE = 1e-6
+"""Deviation of a scale from 1 that is rounding, of files in single precision, too."""
+
+
 @dataclass(frozen=True, slots=True)
 class StageReport:
     """What one stage of the pipeline did.
@@ -121,7 +125,8 @@ class MovingSurface:
         centred on the origin. Memory-mapped where the run wrote to a folder; a lazy dask array on
         a zarr store where the measurements were a dask array too.
     cameras : ndarray of shape (T, 2, 3), float64, read-only
-        R: orthonormal rows of the orthographic camera of each frame.
+        R: orthonormal rows of the orthographic camera of each frame; with
+        ``camera_scale="varying"`` times its scale, of geometric mean 1.
     translations : ndarray of shape (T, 2), float64, read-only
         t: image position of the shape's centroid.
     """
@@ -139,10 +144,21 @@ class MovingSurface:
                 object.__setattr__(self, name, array.view())
 
     @property
+    def scales(self) -> NDArray[np.float64]:
+        """Scales (T,) of the cameras: exactly 1 where they keep it."""
+        scales = np.sqrt((self.cameras**2).sum(axis=(1, 2)) / 2.0)
+        constant = np.abs(scales - 1.0).max(initial=0.0) <= _SAME_SCALE
+        return np.ones(len(scales)) if constant else scales
+
+    @property
     def rotations(self) -> NDArray[np.float64]:
-        """Cameras (T, 3, 3) completed by the viewing direction, the cross product of the rows."""
-        depth = np.cross(self.cameras[:, 0], self.cameras[:, 1])
-        return np.concatenate([self.cameras, depth[:, None]], axis=1)
+        """Cameras (T, 3, 3) without scale, completed by the viewing direction.
+
+        That is the cross product of the rows.
+        """
+        cameras = self.cameras / self.scales[:, None, None]
+        depth = np.cross(cameras[:, 0], cameras[:, 1])
+        return np.concatenate([cameras, depth[:, None]], axis=1)
 
     def in_camera_frame(self) -> NDArray[np.floating[Any]]:
         """Return the shapes (T, N, 3) turned into the camera frame of each frame, R3_t S_t."""

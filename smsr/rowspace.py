@@ -12,6 +12,7 @@ Gram matrix W W^T would be cheaper, and would lose half of the digits of the sma
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from contextlib import closing
 from dataclasses import dataclass
@@ -90,6 +91,20 @@ class RowSpace:
         """Root mean square of the centred W."""
         positions = 2 * self.frames * self.points
         return math.sqrt(float((self.singular_values**2).sum()) / positions)
+
+    def divided(self, scales: NDArray[np.float64]) -> RowSpace:
+        """Return the space of W with each frame divided by its scale (T,)."""
+        rows = 1.0 / np.repeat(scales, 2)
+        with few_blas_threads(self.factor):
+            left, values, _ = np.linalg.svd(rows[:, None] * self.factor, full_matrices=False)
+        rank = _rank(values, len(left))
+        return dataclasses.replace(
+            self,
+            means=rows * self.means,
+            factor=_signed(left[:, :rank]) * values[:rank],
+            singular_values=values[:rank],
+            sample=rows[:, None] * self.sample,
+        )
 
     @property
     def translations(self) -> NDArray[np.float64]:
@@ -184,18 +199,27 @@ def _row_space(total: Triangle, shift: NDArray[np.float64], source: MeasurementS
     precision = np.finfo(source.dtype if single else np.float64).eps
     if spread <= precision * float(np.abs(means).max()):
         raise constant_measurements()
-    tolerance = _EPS * max(32, 2 * source.frames)
-    rank = int(np.count_nonzero(values > tolerance * values[0]))
-    left = right[:rank].T
-    left *= np.sign(np.take_along_axis(left, np.abs(left).argmax(axis=0)[None], axis=0))
+    rank = _rank(values, 2 * source.frames)
     return RowSpace(
         means=means,
-        factor=left * values[:rank],
+        factor=_signed(right[:rank].T) * values[:rank],
         singular_values=values[:rank],
         frames=source.frames,
         points=source.points,
         sample=total.sample - total.mean[:, None],
     )
+
+
+def _rank(values: NDArray[np.float64], rows: int) -> int:
+    """Return how many singular values, largest first, are above rounding."""
+    return int(np.count_nonzero(values > _EPS * max(32, rows) * values[0]))
+
+
+def _signed(left: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return singular vectors with the sign that makes the largest entry positive."""
+    signs = np.sign(np.take_along_axis(left, np.abs(left).argmax(axis=0)[None], axis=0))
+    signed: NDArray[np.float64] = left * signs
+    return signed
 
 
 def _too_large() -> InputError:

@@ -317,4 +317,6 @@ def _error_table(error: Evaluation) -> Table:
     table.add_row("e3D", f"[bold]{error.e3d:.4f}[/]", f"in the {error.frame} frame")
     table.add_row("", f"{error.e3d_per_frame:.4f}", "each frame aligned on its own")
     table.add_row("", f"{error.relative_rms:.4f}", "relative RMS")
+    if error.scale != 1.0:
+        table.add_row("", f"{error.scale:.4f}", "scale that was fitted, the size being open")
     return table

@@ -26,9 +26,9 @@ from smsr.alignment import orthogonal_factor
 from smsr.files import open_array
 from smsr.lifting import denoised_lifting
 from smsr.measurements import as_source
-from smsr.noise import virtual_points
 from smsr.options import Options
 from smsr.pipeline import reconstruct
+from smsr.reduction import Reduction
 from smsr.rotations import complete
 from smsr.rowspace import factorise
 from smsr.shapes import estimate_shapes
@@ -289,16 +289,17 @@ def with_true_cameras(W: Array, rotations: Array) -> Array:
         Cameras completed by the viewing direction.
     """
     space = factorise(as_source(W))
-    points = virtual_points(space.left, space.singular_values, space.points).leading()
-    unit = points.values[0]
+    options = Options()
+    reduction = Reduction.of(space, options)
     found = estimate_shapes(
-        points.measurements / unit,
+        reduction.measurements,
         rotations,
-        Options(),
-        noise=points.noise / space.spread,
-        points=points.coordinates @ space.sample,
+        options,
+        noise=reduction.noise,
+        points=reduction.sample,
     )
-    return denoised_lifting(unit * found.shapes, points.coordinates).apply(W - space.means[:, None])
+    lifting = denoised_lifting(reduction.unit * found.shapes, reduction.points.coordinates)
+    return lifting.apply(W - space.means[:, None])
 
 
 def measure_member(folder: Path, key: Key) -> Member:

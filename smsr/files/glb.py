@@ -594,7 +594,8 @@ def _quantise(values: Array, span: float) -> NDArray[np.int16]:
 
 def _upright(camera: Array, *, down: bool) -> NDArray[np.float64]:
     """Return the rotation (3, 3) from the object frame to x right, y up, z towards the viewer."""
-    right, v = np.asarray(camera, np.float64)
+    rows = np.asarray(camera, np.float64)
+    right, v = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     up = -v if down else v
     return np.stack([right, up, np.cross(right, up)])
 

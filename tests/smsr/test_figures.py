@@ -149,6 +149,12 @@ def test_v_may_grow_both_ways(source: FigureSource) -> None:
     assert not centred.down
 
 
+def test_the_scale_of_the_camera_does_not_turn_it(source: FigureSource) -> None:
+    scales = np.linspace(0.5, 2.0, len(source.cameras))[:, None, None]
+    scaled = dataclasses.replace(source, cameras=scales * source.cameras)
+    np.testing.assert_allclose(scaled.rotations, source.rotations, atol=1e-12)
+
+
 def test_view_angles_are_those_that_the_camera_turned_by() -> None:
     first = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
     angles = np.radians([[0, 0, 0], [70, 0, 0], [-30, 40, 0], [20, -10, 25], [150, 60, -80]])

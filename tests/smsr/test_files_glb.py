@@ -60,13 +60,18 @@ def reader(shapes: NDArray[Any]) -> Callable[[int, int], NDArray[Any]]:
     return lambda start, stop: rows[start:stop]
 
 
-def glb(shapes: NDArray[Any], faces: NDArray[Any] | None = None, **options: Any) -> Glb:
+def glb(
+    shapes: NDArray[Any],
+    faces: NDArray[Any] | None = None,
+    camera: NDArray[Any] = EXAMPLE.cameras[0],
+    **options: Any,
+) -> Glb:
     frames, points = shapes.shape[:2]
     return Glb(
         reader(shapes),
         frames=frames,
         points=points,
-        camera=EXAMPLE.cameras[0],
+        camera=camera,
         faces=faces,
         options=GlbOptions(**options),
     )
@@ -231,6 +236,12 @@ def test_the_first_camera_looks_at_it_from_the_front() -> None:
     flipped = down["nodes"][0]["rotation"]
     # The same view, turned by 180 degrees about the axis that points right.
     np.testing.assert_allclose(np.abs(flipped), np.abs([w, z, y, x]), atol=1e-12)
+
+
+def test_the_scale_of_the_camera_does_not_matter() -> None:
+    plain = glb(SHAPES, EXAMPLE.faces)
+    near = glb(SHAPES, EXAMPLE.faces, camera=2.0 * EXAMPLE.cameras[0])
+    assert b"".join(near.pieces()) == b"".join(plain.pieces())
 
 
 def test_pixels_are_told_by_their_signs(tmp_path: Path) -> None:

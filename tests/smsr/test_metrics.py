@@ -135,6 +135,23 @@ def test_scale_is_charged() -> None:
     assert evaluation.relative_rms == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("frame", ["object", "camera"])
+def test_scale_is_free_under_cameras_of_varying_scale(frame: Literal["object", "camera"]) -> None:
+    """They tell no absolute size; how sizes of frames compare does count."""
+    truth = EXAMPLE.ground_truth if frame == "object" else in_camera_frame(EXAMPLE)
+    scales = np.linspace(0.8, 1.2, len(truth))[:, None, None]
+    smaller = reconstruction(EXAMPLE.ground_truth / 7.0, scales * EXAMPLE.cameras)
+    evaluation = evaluate(truth, smaller)
+    assert evaluation.frame == frame
+    assert evaluation.scale == pytest.approx(7.0)
+    assert evaluation.e3d == pytest.approx(0.0, abs=1e-12)
+    assert evaluation.e3d_per_frame == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(evaluation.alignment @ evaluation.alignment.T, np.eye(3), atol=1e-12)
+    grown = reconstruction(scales * EXAMPLE.ground_truth, scales * EXAMPLE.cameras)
+    assert evaluate(truth, grown, frame=frame).e3d > 0.05
+    assert evaluate(truth, perfect(EXAMPLE)).scale == 1.0
+
+
 @pytest.mark.parametrize("form", ["rows", "points last", "float32", "fortran"])
 def test_every_layout_of_the_truth_is_read(form: str) -> None:
     truth = EXAMPLE.ground_truth

@@ -285,6 +285,28 @@ def relative(S: NDArray[Any], reference: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(S - reference) / np.linalg.norm(reference))
 
 
+class TestDivided:
+    @pytest.mark.parametrize(("frames", "points"), [(5, 40), (30, 8)])
+    def test_is_the_space_of_divided_measurements(self, frames: int, points: int) -> None:
+        W = low_rank(frames, points)
+        scales = np.random.default_rng(0).uniform(0.3, 3.0, frames)
+        W[4:6] = W[4:5]  # a rank that division keeps
+        divided = factorise(as_source(W)).divided(scales)
+        other = W / np.repeat(scales, 2)[:, None]
+        assert_factor(divided, other)
+        assert len(divided.singular_values) == np.linalg.matrix_rank(centred(other))
+        np.testing.assert_allclose(divided.sample, centred(other), atol=1e-12)
+
+    @pytest.mark.parametrize("cameras", [True, False])
+    def test_its_map_serves_the_measurements(self, cameras: bool) -> None:
+        scales = np.random.default_rng(0).uniform(0.3, 3.0, 6)
+        W = centred(low_rank(6, 30))
+        lifting = some_lifting(6, 3, cameras=cameras)
+        after = lifting.after_division(scales)
+        shapes = lifting.apply(W / np.repeat(scales, 2)[:, None])
+        np.testing.assert_allclose(after.apply(W), shapes, atol=1e-12)
+
+
 class TestMapBack:
     @settings(max_examples=40, deadline=None)
     @given(

@@ -5,7 +5,7 @@ import { h } from "./dom";
 import { label } from "./format";
 
 /** Options that stand in the open; the others wait behind "More options". */
-const COMMON = ["preset", "layout", "missing", "outliers", "camera_model"];
+const COMMON = ["preset", "layout", "missing", "outliers", "camera_model", "camera_scale"];
 
 export interface OptionForm {
   element: HTMLElement;

@@ -107,6 +107,20 @@ describe("aligning ground truth", () => {
     for (const error of aligned.errors) expect(error).toBeLessThan(1e-5);
   });
 
+  it.each(["object", "camera"] as const)(
+    "fits a scale to varying cameras in the %s frame",
+    (frame) => {
+      const scaled = cameras.map((value, k) => value * (1 + 0.1 * Math.floor(k / 6)));
+      const truth = truthOf(frame === "camera");
+      const larger = { ...truth, data: truth.data.map((value) => 3 * value) };
+      const aligned = alignTruth(larger, { frames, points }, shown, scaled, frame)!;
+      for (let t = 0; t < frames; t += 1) expectClose(aligned.frames[t], shapes[t], 4);
+      for (const error of aligned.errors) expect(error).toBeLessThan(1e-5);
+      const charged = alignTruth(larger, { frames, points }, shown, cameras, frame)!;
+      expect(Math.min(...charged.errors)).toBeGreaterThan(0.1);
+    },
+  );
+
   it("takes all orders of axes", () => {
     const { data } = truthOf(false);
     const rows = new Float64Array(data.length);

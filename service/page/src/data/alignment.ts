@@ -115,10 +115,25 @@ function truthIndex(
   return null;
 }
 
-/** The rows of a camera completed by the viewing direction: a rotation R3_t. */
+/** The length of both rows of a camera: 1, or its scale where that varies. */
+function scaleOf(cameras: ArrayLike<number>, frame: number): number {
+  let squares = 0;
+  for (let k = 0; k < 6; k += 1) squares += cameras[6 * frame + k] ** 2;
+  return Math.sqrt(squares / 2);
+}
+
+function scalesVary(cameras: ArrayLike<number>): boolean {
+  for (let t = 0; 6 * t < cameras.length; t += 1) {
+    if (Math.abs(scaleOf(cameras, t) - 1) > 1e-6) return true;
+  }
+  return false;
+}
+
+/** The rows of a camera, without its scale, completed by the viewing direction: R3_t. */
 export function rotationOf(cameras: ArrayLike<number>, frame: number): Matrix3 {
   const R = new Float64Array(9);
-  for (let k = 0; k < 6; k += 1) R[k] = cameras[6 * frame + k];
+  const scale = scaleOf(cameras, frame);
+  for (let k = 0; k < 6; k += 1) R[k] = cameras[6 * frame + k] / scale;
   R[6] = R[1] * R[5] - R[2] * R[4];
   R[7] = R[2] * R[3] - R[0] * R[5];
   R[8] = R[0] * R[4] - R[1] * R[3];
@@ -147,7 +162,8 @@ export interface Shown {
 /**
  * Carry ground truth onto the shapes by one orthogonal matrix for the whole sequence.
  *
- * In the frame "camera" the shapes are turned into each frame's camera first, as the truth is.
+ * In the frame "camera" the shapes are turned into each frame's camera first, as the truth is. One
+ * scale for the sequence is fitted where that of the cameras varies, which leaves the size open.
  */
 export function alignTruth(
   truth: NumberArray,
@@ -162,6 +178,7 @@ export function alignTruth(
   const cross = new Float64Array(9);
   const centred: Float32Array[] = [];
   let deviations = 0;
+  let size = 0;
   for (let k = 0; k < shown.shapes.length; k += 1) {
     const t = shown.frameNumbers[k];
     const X = shown.shapes[k];
@@ -184,6 +201,7 @@ export function alignTruth(
         G[3 * j + axis] = value;
         squares[axis] += value * value;
         for (let c = 0; c < 3; c += 1) part[3 * axis + c] += value * (X[3 * j + c] - x[c]);
+        size += (X[3 * j + axis] - x[axis]) ** 2;
       }
     }
     deviations += squares.reduce((sum, s) => sum + Math.sqrt(s / count), 0) / 3;
@@ -192,12 +210,14 @@ export function alignTruth(
     centred.push(G);
   }
   const Q = orthogonalFactor(cross);
+  const scale = scalesVary(cameras) ? Q.reduce((sum, q, k) => sum + q * cross[k], 0) / size : 1;
   const sigma = deviations / shown.shapes.length;
   const errors: number[] = [];
   for (let k = 0; k < centred.length; k += 1) {
     // G ~ Q R X, so that R^T Q^T G lies on X.
     const turn = frame === "camera" ? product(Q, rotationOf(cameras, shown.frameNumbers[k])) : Q;
-    errors.push(turnOnto(centred[k], turn, shown.shapes[k]) / (sigma * count));
+    for (let i = 0; i < centred[k].length; i += 1) centred[k][i] /= scale;
+    errors.push((scale * turnOnto(centred[k], turn, shown.shapes[k])) / (sigma * count));
   }
   return { frames: centred, sigma, errors };
 }

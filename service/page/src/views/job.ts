@@ -139,6 +139,7 @@ const STAGES: Record<string, string> = {
   opening: "opening the files",
   reading: "reading the tracks",
   factorising: "reducing to virtual points",
+  scales: "finding the scale of the camera",
   cameras: "finding the cameras",
   smoothing: "smoothing the tracks",
   shapes: "finding the shapes",

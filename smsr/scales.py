@@ -1,0 +1,240 @@
+"""The scale of the camera in each frame: an object that comes nearer, or a lens that zooms.
+
+A camera far from the object sees it as the orthographic one does, larger or smaller by a factor
+for each frame (scaled orthography, weak perspective),
+
+    W_t = s_t R_t S_t .
+
+The orthographic solver takes this for an object that swells and shrinks. The tracks alone cannot
+tell the two apart, but few objects do: most of their points keep their distances, or some. So the
+scale of a frame is the factor by which distances between points differ there from those in other
+frames, whatever the rest of them does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import make_smoothing_spline
+
+from smsr.cameras.constraints import OrthonormalityForm, frame_products, orthonormality_form
+from smsr.cameras.estimate import scaled_motion, usable_rank
+from smsr.cameras.relaxed import relaxed_factor
+from smsr.lengths import chosen_points
+from smsr.progress import ignore, part_of
+from smsr.reduction import Reduction
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from smsr.options import Options
+    from smsr.progress import StageHook
+    from smsr.rowspace import RowSpace
+
+MOST_ROUNDS = 5
+TOLERANCE = 0.005
+"""Root mean square of the logarithms of a change that is none."""
+
+_RELAXATIONS = 3
+_BASIS_SIZE = 4
+_TRACE_WEIGHT = 1e-3
+
+_MOST_POINTS = 48
+_LEAST_LENGTH = 0.05  # of the object's size, below which two points are one
+_LEAST_SPREAD = 0.01  # of the logarithm of a length: what keeps better counts no more
+_SMALLEST = 0.03  # scale, as a part of the median
+_FEWEST_FRAMES = 5
+_SMOOTHING = 10.0  # halves what has a period of 11 frames
+_JUMPING = 0.03
+_POLISHES = 20
+_POLISHED = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleEstimate:
+    """Scales of all frames.
+
+    Attributes
+    ----------
+    scales : ndarray of shape (T,)
+        s, of geometric mean 1.
+    iterations : int
+        Rounds, each of which solved for cameras and shapes.
+    converged : bool
+        Whether the last change was below the tolerance.
+    reason : str
+        Why it stopped, for a person.
+    residuals : tuple of float
+        Root mean square of the logarithms of the change in each round.
+    """
+
+    scales: NDArray[np.float64]
+    iterations: int
+    converged: bool
+    reason: str
+    residuals: tuple[float, ...] = ()
+
+
+def varying_scales(
+    space: RowSpace,
+    options: Options,
+    solve: Callable[[RowSpace, StageHook], NDArray[np.float64]],
+    hook: StageHook = ignore,
+) -> ScaleEstimate:
+    """Find the scale of the camera in each frame by turns with cameras and shapes.
+
+    It starts from tracks that are equally large in all frames, so what scales there are hardly
+    matters.
+
+    Parameters
+    ----------
+    space : RowSpace
+        The factored measurements W.
+    options : Options
+        Resolved.
+    solve : callable
+        Takes the factored measurements divided by scales, and returns shapes (T, 3, s) of its
+        sample of points.
+    hook : callable
+        See `smsr.progress.StageHook`.
+    """
+    sizes = np.linalg.norm(space.factor.reshape(space.frames, -1), axis=1)
+    scales = _normalised(sizes)
+    chosen = chosen_points(space.divided(scales).sample, _MOST_POINTS)
+    for _ in range(_RELAXATIONS):
+        scales = _normalised(scales * relaxed_scales(Reduction.of(space.divided(scales), options)))
+    residuals: list[float] = []
+    for index in range(MOST_ROUNDS):
+        part = part_of(hook, index / MOST_ROUNDS, (index + 1) / MOST_ROUNDS)
+        shapes = solve(space.divided(scales), part)
+        before = scales
+        scales = _smooth(scales * common_scales(shapes[:, :, chosen]))
+        residuals.append(float(np.log(scales / before).std()))
+        if residuals[-1] < TOLERANCE:
+            break
+    return ScaleEstimate(
+        scales=scales,
+        iterations=len(residuals),
+        converged=residuals[-1] < TOLERANCE,
+        reason=f"scale of the camera between {scales.min():.3g} and {scales.max():.3g} of its "
+        f"mean; it changed by {residuals[-1]:.1%} in the last of {len(residuals)} rounds",
+        residuals=tuple(residuals),
+    )
+
+
+def relaxed_scales(reduction: Reduction) -> NDArray[np.float64]:
+    """Return scales of the cameras (T,), of geometric mean 1, from a convex problem.
+
+    It is that of `smsr.cameras.relaxed.relaxed_factor`, but for rows of each ``M'_t Q`` that are
+    equally long (paper, Eq. 8), whatever their length, and of mean length 1. Their length is the
+    scale times the coefficient of one basis shape, which the trace brings near the mean shape.
+    """
+    motion = scaled_motion(
+        reduction.left, reduction.values, usable_rank(reduction.values, 3 * _BASIS_SIZE)
+    )
+    uu, vv, _ = frame_products(motion)
+    lengths = 0.5 * (uu + vv)
+    mean, frames = lengths.mean(axis=0), len(lengths)
+    equal = orthonormality_form(motion, unit_scale=False)
+    form = OrthonormalityForm(
+        equal.hessian + frames * np.outer(mean, mean), frames * mean, float(frames)
+    )
+    F, _ = relaxed_factor(motion, trace_weight=_TRACE_WEIGHT, form=form)
+    strengths, vectors = np.linalg.eigh(F)
+    Q = vectors[:, -3:] * np.sqrt(np.maximum(strengths[-3:], 0.0))
+    return _normalised(np.linalg.norm((motion @ Q).reshape(frames, -1), axis=1))
+
+
+def common_scales(shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by what factor the distances between points differ from frame to frame.
+
+    The logarithm of each distance is that of its usual value, plus that of the scale of the frame,
+    plus a rest: a two-way table, fitted by medians (Tukey's median polish), in which distances
+    count by how well they keep.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (T, 3, n)
+        S of some points.
+
+    Returns
+    -------
+    ndarray of shape (T,)
+        Scales of geometric mean 1.
+    """
+    points = shapes.shape[2]
+    first, second = np.triu_indices(points, 1)
+    apart = np.take(shapes, first, axis=2) - np.take(shapes, second, axis=2)
+    lengths = np.sqrt(np.einsum("tip,tip->tp", apart, apart))
+    sizes = np.sqrt((lengths**2).mean(axis=1))
+    usual = np.median(lengths / np.maximum(sizes, np.finfo(float).tiny)[:, None], axis=0)
+    lengths = lengths[:, usual > _LEAST_LENGTH]
+    if lengths.shape[1] == 0:
+        return _normalised(sizes)
+    logarithms = np.log(np.maximum(lengths, _SMALLEST**2 * np.median(lengths)))
+    rows = np.zeros(len(shapes))
+    for _ in range(_POLISHES):
+        rests = logarithms - rows[:, None]
+        columns = np.median(rests, axis=0)
+        spread = np.median(np.abs(rests - columns), axis=0)
+        before = rows
+        rows = _weighted_medians(logarithms - columns, 1.0 / (spread + _LEAST_SPREAD) ** 2)
+        rows = rows - rows.mean()
+        if np.abs(rows - before).max() < _POLISHED:
+            break
+    return _normalised(np.exp(rows))
+
+
+def growth(shapes: NDArray[np.float64]) -> float:
+    """Return by what factor the distances between points grow together, or shrink.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (T, 3, n)
+        S of some points.
+
+    Returns
+    -------
+    float
+        The 95th percentile of the scales that are common to them over the 5th.
+    """
+    least, most = np.percentile(common_scales(shapes), (5.0, 95.0))
+    return float(most / least)
+
+
+def _weighted_medians(
+    values: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the medians (T,) of the rows of values (T, p), each column with its weight (p,)."""
+    order = np.argsort(values, axis=1)
+    share = np.cumsum(weights[order], axis=1)
+    middle = (share < 0.5 * share[:, -1:]).sum(axis=1)
+    return np.take_along_axis(values, np.take_along_axis(order, middle[:, None], 1), 1)[:, 0]
+
+
+def _smooth(scales: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return scales without what changes within a few frames, unless they do jump.
+
+    Cameras come nearer slowly. What shakes is the way they look, and errors in the scale would
+    hide how steadily the object moves.
+    """
+    scales = _normalised(scales)
+    if len(scales) < _FEWEST_FRAMES:
+        return scales
+    frames, logarithms = np.arange(len(scales), dtype=np.float64), np.log(scales)
+    smooth = make_smoothing_spline(frames, logarithms, lam=_SMOOTHING)(frames)
+    if (logarithms - smooth).std() > _JUMPING:
+        return scales
+    return _normalised(np.exp(smooth))
+
+
+def _normalised(scales: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return scales of geometric mean 1, none far below the others."""
+    least = max(_SMALLEST * float(np.median(scales)), np.finfo(float).tiny)
+    logarithms = np.log(np.maximum(scales, least))
+    normalised: NDArray[np.float64] = np.exp(logarithms - logarithms.mean())
+    return normalised
