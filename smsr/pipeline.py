@@ -13,7 +13,6 @@ import math
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -179,7 +178,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
         if options.camera_scale == "constant":
             scaling = None
         else:
-            scaling = varying_scales(space, options, partial(_sampled_shapes, options), hook)
+            scaling = varying_scales(space, options, _sampled_shapes, hook)
             clock.note(scaling)
     if scaling is None:
         return _solve(space, options, clock)
@@ -287,7 +286,7 @@ def _growth(
     return growth(shapes[::step] @ reduction.sample[:, chosen])
 
 
-def _sampled_shapes(options: Options, space: RowSpace, hook: StageHook) -> NDArray[np.float64]:
+def _sampled_shapes(space: RowSpace, options: Options, hook: StageHook) -> NDArray[np.float64]:
     """Return shapes (T, 3, s) of the sample of points."""
     reduction = Reduction.of(space, options)
     estimate = _cameras(reduction, options, part_of(hook, 0.0, 0.5))

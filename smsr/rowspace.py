@@ -92,6 +92,12 @@ class RowSpace:
         positions = 2 * self.frames * self.points
         return math.sqrt(float((self.singular_values**2).sum()) / positions)
 
+    def leading(self, count: int) -> RowSpace:
+        """Return the space of the strongest directions, at most so many."""
+        return dataclasses.replace(
+            self, factor=self.factor[:, :count], singular_values=self.singular_values[:count]
+        )
+
     def divided(self, scales: NDArray[np.float64]) -> RowSpace:
         """Return the space of W with each frame divided by its scale (T,)."""
         rows = 1.0 / np.repeat(scales, 2)

@@ -13,6 +13,7 @@ frames, whatever the rest of them does.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,7 @@ MOST_ROUNDS = 5
 TOLERANCE = 0.005
 """Root mean square of the logarithms of a change that is none."""
 
+_DIRECTIONS = 128
 _RELAXATIONS = 3
 _BASIS_SIZE = 4
 _TRACE_WEIGHT = 1e-3
@@ -82,7 +84,7 @@ class ScaleEstimate:
 def varying_scales(
     space: RowSpace,
     options: Options,
-    solve: Callable[[RowSpace, StageHook], NDArray[np.float64]],
+    solve: Callable[[RowSpace, Options, StageHook], NDArray[np.float64]],
     hook: StageHook = ignore,
 ) -> ScaleEstimate:
     """Find the scale of the camera in each frame by turns with cameras and shapes.
@@ -97,20 +99,22 @@ def varying_scales(
     options : Options
         Resolved.
     solve : callable
-        Takes the factored measurements divided by scales, and returns shapes (T, 3, s) of its
-        sample of points.
+        Takes the factored measurements divided by scales, and options, and returns shapes
+        (T, 3, s) of its sample of points.
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    sizes = np.linalg.norm(space.factor.reshape(space.frames, -1), axis=1)
-    scales = _normalised(sizes)
+    # The weakest directions tell of noise only, and take long to divide where frames are many.
+    options = dataclasses.replace(options, noise=Reduction.of(space, options).points.noise)
+    space = space.leading(_DIRECTIONS)
+    scales = _normalised(np.linalg.norm(space.factor.reshape(space.frames, -1), axis=1))
     chosen = chosen_points(space.divided(scales).sample, _MOST_POINTS)
     for _ in range(_RELAXATIONS):
         scales = _normalised(scales * relaxed_scales(Reduction.of(space.divided(scales), options)))
     residuals: list[float] = []
     for index in range(MOST_ROUNDS):
         part = part_of(hook, index / MOST_ROUNDS, (index + 1) / MOST_ROUNDS)
-        shapes = solve(space.divided(scales), part)
+        shapes = solve(space.divided(scales), options, part)
         before = scales
         scales = _smooth(scales * common_scales(shapes[:, :, chosen]))
         residuals.append(float(np.log(scales / before).std()))

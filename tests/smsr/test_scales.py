@@ -114,7 +114,7 @@ class TestVaryingScales:
         def sizes(of: RowSpace) -> Array:
             return np.asarray(np.linalg.norm(of.factor.reshape(FRAMES, -1), axis=1))
 
-        def solve(divided: RowSpace, _: object) -> Array:
+        def solve(divided: RowSpace, *_: object) -> Array:
             rounds.append(divided)
             shapes: Array = (scales * sizes(divided) / sizes(space))[:, None, None] * BODY
             return shapes
