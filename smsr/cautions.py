@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from smsr.cameras.rigid import RIGID_REST
 from smsr.result import Caution
 from smsr.rotations import spread_of_views
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from smsr.result import StageReport
 
 _FLAT = 0.01
-_RIGID = 0.002
 _LOST = 0.01
 _NOISY = 0.02
 _UNDECIDED = 10.0  # degrees
@@ -54,7 +54,7 @@ def input_cautions(
                 "turns against the camera. Its depth is a guess.",
             )
         )
-    elif _part_beyond(values, 3) < _RIGID:
+    elif _part_beyond(values, 3) < RIGID_REST:
         found.append(
             Caution(
                 "rigid",

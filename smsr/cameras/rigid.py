@@ -12,8 +12,9 @@ from smsr.cameras.estimate import CameraEstimate, cameras_from_factor, scaled_mo
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-RIGID_REST = 0.02
-"""An object is taken for rigid where three directions leave less than this part of the tracks."""
+RIGID_REST = 0.002
+"""An object is taken for rigid where three directions leave less than this part of the tracks. More
+is deformation, however little, and seen well by the cameras and shapes of deforming objects."""
 
 
 def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> CameraEstimate | None:

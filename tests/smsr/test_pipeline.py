@@ -494,6 +494,17 @@ class TestDegenerateInput:
             np.testing.assert_allclose(other, shape, atol=2e-2)
         assert result.diagnostics.basis_size == 1
 
+    def test_an_object_that_hardly_deforms_does_deform(self) -> None:
+        """One shape for all frames leaves half a percent here."""
+        rng = np.random.default_rng(0)
+        mean, change = rng.standard_normal((2, 3, 30))
+        shapes = mean + 0.01 * np.sin(0.2 * np.arange(60))[:, None, None] * change
+        shapes -= shapes.mean(axis=2, keepdims=True)
+        W = (turning(60, 4.0)[:, :2] @ shapes).reshape(120, 30)
+        result = reconstruct(W)
+        assert result.diagnostics.camera_model != "rigid"
+        assert evaluate(shapes, result, frame="object").e3d < 0.002
+
     def test_low_rank_measurements_smaller_than_the_basis(self) -> None:
         W = SEQUENCES["nodding"].measurements
         assert_valid(reconstruct(W, basis_size=30), W)
