@@ -114,6 +114,7 @@ class DepthProblem:
     BALANCE_EVERY = 10
     BALANCE_RATIO = 5.0
     STALLED = 0.9
+    CLEARLY_SIMPLER = 0.65  # part of a nuclear norm
     LEAST_PENALTY = 1e-3  # relative to the first
 
     def __init__(self, measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> None:
@@ -177,7 +178,21 @@ class DepthProblem:
         """Set the depths that move the shape least from frame to frame."""
         factor = self._tridiagonal_factor(1e-6, 1.0)
         self.shapes = self._with_depths(dpttrs(*factor, -self._planar_motion)[0])
-        self.dual[:] = 0.0
+        self.dual = np.zeros_like(self.shapes)
+        self.penalty = 0.0
+
+    def start_over_if_simpler(self) -> bool:
+        """Start from least motion where that alone is clearly simpler than the present shapes.
+
+        Iterations from flat shapes take long where the object is much deeper than wide, as along a
+        limb, and reweighting would keep shapes half flat that are so still.
+        """
+        present, nuclear = (self.shapes, self.dual, self.penalty), float(self.spectrum().sum())
+        self.start_from_least_motion()
+        if float(self.spectrum().sum()) < self.CLEARLY_SIMPLER * nuclear:
+            return True
+        self.shapes, self.dual, self.penalty = present
+        return False
 
     def spectrum(self) -> NDArray[np.float64]:
         """Return the singular values of P S#, largest first."""
@@ -494,7 +509,8 @@ def reweighted_shapes(
     Minimises ``sum_i log(sigma_i(P S#) + eps sigma_1) + lambda/2 ||D S#||_F^2`` subject to
     W = R S by a few rounds of a weighted nuclear norm, w_i = 1 / (sigma_i + eps sigma_1). The
     problem is not convex. It is entered from flat shapes through the plain nuclear norm, so that
-    depth is added only where it makes the shapes simpler.
+    depth is added only where it makes the shapes simpler; but see
+    `DepthProblem.start_over_if_simpler`.
 
     Parameters
     ----------
@@ -514,7 +530,11 @@ def reweighted_shapes(
     if deep:
         problem.start_from_least_motion()
     first = min(_DEEP_FIRST_ITERATIONS if deep else _FIRST_ITERATIONS, max_iterations)
-    converged = problem.minimise(first, tolerance, part_of(hook, 0.0, 1 / (_ROUNDS + 1)))
+    start = part_of(hook, 0.0, 1 / (_ROUNDS + 1))
+    converged = problem.minimise(first, tolerance, start)
+    left = min(_DEEP_FIRST_ITERATIONS, max_iterations - len(problem.residuals))
+    if not deep and left > 0 and problem.start_over_if_simpler():
+        converged = problem.minimise(left, tolerance, start)
     complexity = problem.complexity()
     offset = by_turn_speed(rotations, *_LOG_OFFSETS) if coherent else _LOG_OFFSETS[0]
     by_flicker = flicker(problem) if coherent else 0.0

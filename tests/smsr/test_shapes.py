@@ -225,6 +225,19 @@ class TestReweighted:
         scaled = reweighted_shapes(scale * W, rotations).shapes
         np.testing.assert_allclose(scaled, scale * plain, rtol=1e-6, atol=1e-8 * scale)
 
+    @pytest.mark.parametrize("frames", [10, 16])
+    def test_an_object_much_deeper_than_wide_is_not_left_half_flat(self, frames: int) -> None:
+        rng = np.random.default_rng(0)
+        time = np.linspace(0.0, 1.0, frames)
+        mean = rng.standard_normal((3, 40)) * np.array([[1.0], [1.0], [8.0]])
+        weights = 0.2 * np.cos(6.3 * time[:, None] + np.arange(3))
+        shapes = mean + np.tensordot(weights, rng.standard_normal((3, 3, 40)), axes=1)
+        shapes -= shapes.mean(axis=2, keepdims=True)
+        swing = np.radians(30.0) * np.sin(6.3 * time)
+        rotations = so3.exp(swing[:, None] * np.array([0.1, 1.0, 0.2]))
+        W = (rotations[:, :2] @ shapes).reshape(2 * frames, -1)
+        assert relative_error(reweighted_shapes(W, rotations).shapes, shapes) < 0.08
+
     def test_flat_tracks_of_a_still_camera_get_no_depth(self) -> None:
         W, rotations, _ = sequence()
         still = np.broadcast_to(rotations[0], rotations.shape)
