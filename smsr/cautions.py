@@ -27,6 +27,7 @@ _UNDECIDED = 10.0  # degrees
 _WEAK_DEPTH = 0.75
 _STEADY_ENOUGH = 0.5
 _GROWING = 1.25
+_GROWING_IN_DOUBT = 1.5
 _LITTLE_ROTATION = math.radians(10.0)
 
 
@@ -152,9 +153,17 @@ def depth_cautions(complexity: float, steadiness: float) -> list[Caution]:
     ]
 
 
-def size_cautions(growth: float) -> list[Caution]:
-    """Judge by what factor the object grows, see `smsr.scales.growth`."""
-    if growth <= _GROWING:
+def size_cautions(growth: float, complexity: float) -> list[Caution]:
+    """Judge by what factor the object grows.
+
+    Parameters
+    ----------
+    growth : float
+        See `smsr.scales.growth`.
+    complexity : float
+        See `smsr.shapes.DepthProblem.complexity`: where depth is a guess, so are distances.
+    """
+    if growth <= (_GROWING if complexity <= _WEAK_DEPTH else _GROWING_IN_DOUBT):
         return []
     return [
         Caution(

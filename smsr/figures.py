@@ -16,6 +16,7 @@ import numpy as np
 
 from smsr.errors import FiguresUnavailable, NothingToDraw
 from smsr.files.glb import v_grows_down
+from smsr.rotations import camera_scales
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -115,7 +116,7 @@ class FigureSource:
     def rotations(self) -> NDArray[np.float64]:
         """Rotations (T, 3, 3) to x right, y up, z towards the viewer."""
         cameras = np.asarray(self.cameras, np.float64)
-        cameras = cameras / np.linalg.norm(cameras, axis=2, keepdims=True)
+        cameras = cameras / camera_scales(cameras)[:, None, None]
         if self.down:
             cameras[:, 1] *= -1.0
         depth = np.cross(cameras[:, 0], cameras[:, 1])

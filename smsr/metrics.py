@@ -53,7 +53,7 @@ class Evaluation:
     ----------
     e3d : float
         Mean Euclidean distance between points in units of sigma (Eq. 24 of the paper, with the
-        distance that its text names): ``1/(sigma T N) sum_t sum_j ||G_tj - X_tj||``. Sigma is the
+        distance that its text names): ``1/(sigma T N) sum_t sum_j ||G_tj - c X_tj||``. Sigma is the
         mean over frames and axes of the standard deviation of the true coordinates over points.
     e3d_squared : float
         The same with the squared distance, as Eq. 24 is printed. It has the unit of the data.
@@ -63,7 +63,7 @@ class Evaluation:
     per_frame : tuple of T floats
         Each frame's part of `e3d`, whose mean is `e3d`.
     relative_rms : float
-        Mean over frames of ``||X_t - G_t||_F / ||G_t||_F`` (Sec. 4.4), over the frames in which
+        Mean over frames of ``||c X_t - G_t||_F / ||G_t||_F`` (Sec. 4.4), over the frames in which
         the true points do not all coincide.
     frame : {"camera", "object"}
         Which shapes were compared, ``R3_t S_t`` or ``S_t``.
@@ -126,9 +126,10 @@ def evaluate(
 
     Notes
     -----
-    "auto" compares two explanations of the reconstructed images ``R_t S_t`` by the ground truth:
-    one affine camera for the sequence, and one for each frame. The second fits either kind of
-    ground truth up to noise. The first fits as well only if the ground truth turns with the camera.
+    "auto" compares two explanations of the reconstructed images ``R_t S_t``, without scale, by the
+    ground truth: one affine camera for the sequence, and one for each frame. The second fits either
+    kind of ground truth up to noise. The first fits as well only if the ground truth turns with the
+    camera.
     """
     if frame not in ("auto", "camera", "object"):
         raise InvalidOption(

@@ -8,6 +8,7 @@ time only as far as the noise reaches.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -50,12 +51,16 @@ class VirtualPoints:
         virtual points: the measurements, less noise, are ``U Sigma C W``.
     noise : float
         Standard deviation of the noise that was taken off, in the units of W; 0 for none.
+    neglected : float
+        That of noise that was left in, as far as it can be estimated; infinite where there are too
+        few frames or points to tell.
     """
 
     left: NDArray[np.float64]
     values: NDArray[np.float64]
     coordinates: NDArray[np.float64]
     noise: float = 0.0
+    neglected: float = 0.0
 
     @property
     def measurements(self) -> NDArray[np.float64]:
@@ -75,8 +80,11 @@ class VirtualPoints:
             count = min(MOST_POINTS, int((rest > NEGLIGIBLE_REST**2 * rest[0]).sum()))
         if count >= len(self.values):
             return self
-        return VirtualPoints(
-            self.left[:, :count], self.values[:count], self.coordinates[:count], self.noise
+        return dataclasses.replace(
+            self,
+            left=self.left[:, :count],
+            values=self.values[:count],
+            coordinates=self.coordinates[:count],
         )
 
 
@@ -101,10 +109,12 @@ def virtual_points(
         given, and then neglected below `LEAST_NOISE`.
     """
     rows = len(left)
-    sigma = estimate_noise(values, rows, points) if noise is None else noise
+    estimated = estimate_noise(values, rows, points)
+    sigma = estimated if noise is None else noise
     spread = math.sqrt(float((values**2).sum()) / (rows * points))
     if sigma <= (LEAST_NOISE * spread if noise is None else 0.0):
-        return VirtualPoints(left, values, left.T / values[:, None])
+        neglected = estimated if _can_tell(rows, points) else math.inf
+        return VirtualPoints(left, values, left.T / values[:, None], neglected=neglected)
     kept = max(3, int((values > sigma * (math.sqrt(rows) + math.sqrt(points))).sum()))
     quiet = smooth_in_time(left[:, :kept] * values[:kept], sigma)
     directions, strengths, turn = np.linalg.svd(quiet, full_matrices=False)
@@ -133,7 +143,7 @@ def estimate_noise(values: NDArray[np.float64], rows: int, points: int) -> float
         The median ratio of the smallest quarter of the singular values to the quantiles of the
         Marchenko-Pastur law; 0 where the matrix is too small to tell.
     """
-    if rows < 2 * _FEWEST_FRAMES or points < _FEWEST_POINTS:
+    if not _can_tell(rows, points):
         return 0.0
     # Rows are centred on their mean, so W lies in points - 1 dimensions.
     columns = points - 1
@@ -145,6 +155,11 @@ def estimate_noise(values: NDArray[np.float64], rows: int, points: int) -> float
     weakest = spectrum[::-1][:count]
     quantiles = marchenko_pastur_quantiles(short / long, (np.arange(count) + 0.5) / short)
     return float(np.median(weakest / (quantiles * math.sqrt(long))))
+
+
+def _can_tell(rows: int, points: int) -> bool:
+    """Tell whether the matrix is large enough for an estimate of its noise."""
+    return rows >= 2 * _FEWEST_FRAMES and points >= _FEWEST_POINTS
 
 
 def marchenko_pastur_quantiles(

@@ -38,7 +38,7 @@ from smsr.reduction import Reduction
 from smsr.result import Diagnostics, Reconstruction, StageReport
 from smsr.rotations import angles_between
 from smsr.rowspace import factorise, map_back
-from smsr.scales import growth, varying_scales
+from smsr.scales import divided, growth, noise_gain, varying_scales
 from smsr.shapes import basis_size_of, estimate_shapes
 from smsr.streaming import one_blas_thread
 from smsr.trajectories import smooth_trajectories
@@ -63,8 +63,11 @@ if TYPE_CHECKING:
 STAGES = ("reading", "factorising", "scales", "cameras", "smoothing", "shapes", "writing")
 """Names of the stages, in order."""
 
-_SHARES = dict(zip(STAGES, (0.02, 0.18, 0.10, 0.22, 0.05, 0.18, 0.25), strict=True))
-"""Part of the progress bar that each stage moves."""
+_SHARES = {
+    "constant": dict(zip(STAGES, (0.02, 0.23, 0.0, 0.25, 0.05, 0.20, 0.25), strict=True)),
+    "varying": dict(zip(STAGES, (0.02, 0.13, 0.45, 0.12, 0.03, 0.10, 0.15), strict=True)),
+}
+"""Part of the progress bar that each stage moves, by the option `camera_scale`."""
 
 _GROWTH_FRAMES, _GROWTH_POINTS = 100, 24  # of which growth is told
 
@@ -123,7 +126,7 @@ def reconstruct(
     Reconstruction, 3DV 2017; `preset="paper"` follows it to the letter.
     """
     options = _merge(options, option_values)
-    clock = _Clock(progress)
+    clock = _Clock(progress, _SHARES[options.camera_scale])
     with clock.stage("reading"):
         as_given = visibility is None and options.missing == "refuse"
         source = as_source(measurements, options.layout, check=as_given)
@@ -182,11 +185,13 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             clock.note(scaling)
     if scaling is None:
         return _solve(space, options, clock)
-    solution = _solve(space.divided(scaling.scales), options, clock)
+    scales = scaling.scales
+    solution = _solve(*divided(space, options, scales), clock)
     return dataclasses.replace(
         solution,
-        cameras=scaling.scales[:, None, None] * solution.cameras,
-        lifting=solution.lifting.after_division(scaling.scales),
+        cameras=scales[:, None, None] * solution.cameras,
+        lifting=solution.lifting.after_division(scales),
+        noise=solution.noise / noise_gain(scales),
     )
 
 
@@ -232,7 +237,7 @@ def _solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
             *input_cautions(space.singular_values, points, space.points),
             *camera_cautions(rotations, estimate),
             *depth_cautions(found.complexity, found.steadiness),
-            *size_cautions(_growth(found.shapes, reduction, space, options)),
+            *size_cautions(_growth(found.shapes, reduction, space, options), found.complexity),
             *convergence_cautions(clock.reports),
         ),
     )
@@ -248,6 +253,7 @@ def _cameras(reduction: Reduction, options: Options, hook: StageHook) -> CameraE
             hook,
             points=reduction.sample,
             noise=reduction.noise,
+            neglected=reduction.neglected,
         )
     )
 
@@ -320,18 +326,19 @@ def _smooth(
 class _Clock:
     """Times the stages and turns their reports into those of the run."""
 
-    def __init__(self, callback: ProgressCallback | None) -> None:
+    def __init__(self, callback: ProgressCallback | None, shares: Mapping[str, float]) -> None:
         self._callback = callback
+        self._shares = shares
         self._done = 0.0
         self.reports: list[StageReport] = []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[StageHook]:
         """Time a stage; the hook it gets reports and cancels."""
-        first = sum(_SHARES[before] for before in STAGES[: STAGES.index(name)])
+        first = sum(self._shares[before] for before in STAGES[: STAGES.index(name)])
 
         def hook(fraction: float, iteration: int, residual: float | None) -> None:
-            self._report(name, first + min(fraction, 1.0) * _SHARES[name], iteration, residual)
+            self._report(name, first + min(fraction, 1.0) * self._shares[name], iteration, residual)
 
         hook(0.0, 0, None)
         self.reports.append(StageReport(name, 0.0))

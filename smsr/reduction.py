@@ -30,6 +30,8 @@ class Reduction:
         Singular values of the virtual points over `unit`, largest first.
     noise : float
         Standard deviation of the noise that was taken off, as a part of the tracks' spread.
+    neglected : float
+        The same of noise that was left in, see `smsr.noise.VirtualPoints`.
     sample : ndarray of shape (q, s)
         Some real points as combinations of the virtual ones.
     """
@@ -38,6 +40,7 @@ class Reduction:
     unit: float
     values: NDArray[np.float64]
     noise: float
+    neglected: float
     sample: NDArray[np.float64]
 
     @classmethod
@@ -52,6 +55,7 @@ class Reduction:
             unit=unit,
             values=points.values / unit,
             noise=points.noise / space.spread,
+            neglected=points.neglected / space.spread,
             sample=points.coordinates @ space.sample,
         )
 

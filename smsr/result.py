@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from smsr.rotations import camera_scales
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smsr.options import Options
-
-
-_SAME_SCALE = 1e-6
-"""Deviation of a scale from 1 that is rounding, of files in single precision, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +144,7 @@ class MovingSurface:
     @property
     def scales(self) -> NDArray[np.float64]:
         """Scales (T,) of the cameras: exactly 1 where they keep it."""
-        scales = np.sqrt((self.cameras**2).sum(axis=(1, 2)) / 2.0)
-        constant = np.abs(scales - 1.0).max(initial=0.0) <= _SAME_SCALE
-        return np.ones(len(scales)) if constant else scales
+        return camera_scales(self.cameras)
 
     @property
     def rotations(self) -> NDArray[np.float64]:

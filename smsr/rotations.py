@@ -92,6 +92,21 @@ def mirror(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     return complete(rotations[:, :2] * flip)
 
 
+SAME_SCALE = 1e-4
+"""Deviation of a camera's scale from 1 that is rounding, as in a file of few digits."""
+
+
+def camera_scales(cameras: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the scales (T,) of cameras (T, 2, 3), the length of their rows.
+
+    They are exactly 1 where no camera has another.
+    """
+    scales: NDArray[np.float64] = np.sqrt((cameras**2).sum(axis=(1, 2)) / 2.0)
+    if np.abs(scales - 1.0).max(initial=0.0) <= SAME_SCALE:
+        return np.ones(len(scales))
+    return np.maximum(scales, np.finfo(float).tiny)
+
+
 def spread_of_views(rotations: NDArray[np.float64]) -> float:
     """Return about the widest angle, in radians, between viewing directions of (T, 3, 3)."""
     axes = rotations[:, 2]

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
+from scipy.ndimage import maximum_filter1d
 
 from smsr.cameras.constraints import OrthonormalityForm, frame_products, orthonormality_form
 from smsr.cameras.estimate import scaled_motion, usable_rank
@@ -51,7 +52,9 @@ _LEAST_SPREAD = 0.01  # of the logarithm of a length: what keeps better counts n
 _SMALLEST = 0.03  # scale, as a part of the median
 _FEWEST_FRAMES = 5
 _SMOOTHING = 10.0  # halves what has a period of 11 frames
-_JUMPING = 0.03
+_JUMP = 0.06  # of the logarithm
+_AROUND_JUMPS = 11  # frames
+_UNSEEN = 1e-6  # size in the image, as a part of the largest
 _POLISHES = 20
 _POLISHED = 1e-4
 
@@ -107,16 +110,24 @@ def varying_scales(
     # The weakest directions tell of noise only, and take long to divide where frames are many.
     options = dataclasses.replace(options, noise=Reduction.of(space, options).points.noise)
     space = space.leading(_DIRECTIONS)
-    scales = _normalised(np.linalg.norm(space.factor.reshape(space.frames, -1), axis=1))
+    sizes = np.linalg.norm(
+        space.factor.reshape(space.frames, -1) / space.singular_values[0], axis=1
+    )
+    seen = sizes > _UNSEEN * sizes.max()
+    scales = _interpolated(sizes, seen)
     chosen = chosen_points(space.divided(scales).sample, _MOST_POINTS)
+    hooks = [
+        part_of(hook, k / (MOST_ROUNDS + 1), (k + 1) / (MOST_ROUNDS + 1))
+        for k in range(MOST_ROUNDS + 1)
+    ]
     for _ in range(_RELAXATIONS):
-        scales = _normalised(scales * relaxed_scales(Reduction.of(space.divided(scales), options)))
+        reduction = Reduction.of(*divided(space, options, scales))
+        scales = _interpolated(scales * relaxed_scales(reduction, hooks[0]), seen)
     residuals: list[float] = []
-    for index in range(MOST_ROUNDS):
-        part = part_of(hook, index / MOST_ROUNDS, (index + 1) / MOST_ROUNDS)
-        shapes = solve(space.divided(scales), options, part)
+    for part in hooks[1:]:
+        shapes = solve(*divided(space, options, scales), part)
         before = scales
-        scales = _smooth(scales * common_scales(shapes[:, :, chosen]))
+        scales = _smooth(_interpolated(scales * common_scales(shapes[:, :, chosen]), seen))
         residuals.append(float(np.log(scales / before).std()))
         if residuals[-1] < TOLERANCE:
             break
@@ -130,7 +141,21 @@ def varying_scales(
     )
 
 
-def relaxed_scales(reduction: Reduction) -> NDArray[np.float64]:
+def divided(
+    space: RowSpace, options: Options, scales: NDArray[np.float64]
+) -> tuple[RowSpace, Options]:
+    """Return measurements divided by scales (T,), and options with the noise they have then."""
+    if options.noise is not None:
+        options = dataclasses.replace(options, noise=options.noise * noise_gain(scales))
+    return space.divided(scales), options
+
+
+def noise_gain(scales: NDArray[np.float64]) -> float:
+    """Return by how much the noise of measurements grows when they are divided by scales (T,)."""
+    return float(np.sqrt((1.0 / scales**2).mean()))
+
+
+def relaxed_scales(reduction: Reduction, hook: StageHook = ignore) -> NDArray[np.float64]:
     """Return scales of the cameras (T,), of geometric mean 1, from a convex problem.
 
     It is that of `smsr.cameras.relaxed.relaxed_factor`, but for rows of each ``M'_t Q`` that are
@@ -147,7 +172,7 @@ def relaxed_scales(reduction: Reduction) -> NDArray[np.float64]:
     form = OrthonormalityForm(
         equal.hessian + frames * np.outer(mean, mean), frames * mean, float(frames)
     )
-    F, _ = relaxed_factor(motion, trace_weight=_TRACE_WEIGHT, form=form)
+    F, _ = relaxed_factor(motion, trace_weight=_TRACE_WEIGHT, form=form, hook=hook)
     strengths, vectors = np.linalg.eigh(F)
     Q = vectors[:, -3:] * np.sqrt(np.maximum(strengths[-3:], 0.0))
     return _normalised(np.linalg.norm((motion @ Q).reshape(frames, -1), axis=1))
@@ -221,24 +246,38 @@ def _weighted_medians(
 
 
 def _smooth(scales: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return scales without what changes within a few frames, unless they do jump.
+    """Return scales without what changes within a few frames, but where they jump.
 
     Cameras come nearer slowly. What shakes is the way they look, and errors in the scale would
     hide how steadily the object moves.
     """
-    scales = _normalised(scales)
     if len(scales) < _FEWEST_FRAMES:
         return scales
     frames, logarithms = np.arange(len(scales), dtype=np.float64), np.log(scales)
     smooth = make_smoothing_spline(frames, logarithms, lam=_SMOOTHING)(frames)
-    if (logarithms - smooth).std() > _JUMPING:
-        return scales
-    return _normalised(np.exp(smooth))
+    jumps = maximum_filter1d(np.abs(logarithms - smooth), _AROUND_JUMPS) > _JUMP
+    return _normalised(np.exp(np.where(jumps, logarithms, smooth)))
+
+
+def _interpolated(scales: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return scales with those of frames in which no two points differ taken from their neighbours.
+
+    Parameters
+    ----------
+    scales : ndarray of shape (T,)
+    seen : ndarray of shape (T,)
+        Which frames are others.
+    """
+    frames = np.arange(len(scales))
+    known = np.log(_normalised(scales[seen]))
+    return _normalised(np.exp(np.interp(frames, frames[seen], known)))
 
 
 def _normalised(scales: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return scales of geometric mean 1, none far below the others."""
-    least = max(_SMALLEST * float(np.median(scales)), np.finfo(float).tiny)
-    logarithms = np.log(np.maximum(scales, least))
+    positive = scales[scales > 0.0]
+    if len(positive) == 0:
+        return np.ones(len(scales))
+    logarithms = np.log(np.maximum(scales, _SMALLEST * float(np.median(positive))))
     normalised: NDArray[np.float64] = np.exp(logarithms - logarithms.mean())
     return normalised

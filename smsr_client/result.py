@@ -25,7 +25,7 @@ class Result:
         S: points of each frame in the object's frame, each frame centred, in the unit of the
         measurements.
     cameras : ndarray of shape (T, 2, 3), float64
-        R: orthonormal rows.
+        R: orthonormal rows, times the scale of the camera with ``camera_scale=varying``.
     translations : ndarray of shape (T, 2), float64
         t: the centre of the shape in the image.
     faces : ndarray of shape (F, 3), int32, or None

@@ -13,8 +13,26 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RIGID_REST = 0.002
-"""An object is taken for rigid where three directions leave less than this part of the tracks. More
-is deformation, however little, and seen well by the cameras and shapes of deforming objects."""
+"""An object is taken for rigid where three directions leave less than this part of the tracks, or
+noise may have left the rest. More is deformation, however little, and seen well by the cameras and
+shapes of deforming objects."""
+
+_MOST_REST = 0.02  # that noise may have left
+_ABOVE_NOISE = 1.2
+
+
+def looks_rigid(values: NDArray[np.float64], neglected: float = 0.0) -> bool:
+    """Tell whether three directions explain the tracks so well that the object may be rigid.
+
+    Parameters
+    ----------
+    values : ndarray of shape (r,)
+        Singular values of the centred measurements, largest first.
+    neglected : float
+        Standard deviation of noise that was left in, as a part of the tracks' spread.
+    """
+    limit = min(max(RIGID_REST, _ABOVE_NOISE * neglected), _MOST_REST)
+    return bool(np.linalg.norm(values[3:]) < limit * np.linalg.norm(values))
 
 
 def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> CameraEstimate | None:

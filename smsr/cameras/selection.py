@@ -15,7 +15,7 @@ import numpy as np
 
 from smsr.cameras.free import every_frame, free_cameras
 from smsr.cameras.paper import published_cameras
-from smsr.cameras.rigid import RIGID_REST, rigid_cameras
+from smsr.cameras.rigid import looks_rigid, rigid_cameras
 from smsr.cameras.trial import Trial
 from smsr.cameras.turn import refine_velocity
 from smsr.progress import ignore, part_of
@@ -63,6 +63,7 @@ def estimate_cameras(
     *,
     points: NDArray[np.float64] | None = None,
     noise: float = 0.0,
+    neglected: float = 0.0,
 ) -> CameraEstimate:
     """Find the cameras of all frames in the way that the options ask for.
 
@@ -82,6 +83,8 @@ def estimate_cameras(
     noise : float
         Standard deviation of the noise that was taken off, as a part of the tracks' spread; 0 for
         none.
+    neglected : float
+        The same of noise that was left in, see `smsr.noise.VirtualPoints`.
     """
     if options.camera_model == "paper":
         return published_cameras(
@@ -91,7 +94,7 @@ def estimate_cameras(
             max_iterations=options.camera_iterations,
             hook=hook,
         )
-    if options.camera_model == "auto" and looks_rigid(values):
+    if options.camera_model == "auto" and looks_rigid(values, neglected):
         rigid = rigid_cameras(left, values)
         if rigid is not None:
             return rigid
@@ -110,11 +113,6 @@ def estimate_cameras(
     if options.camera_model == "uniform":
         return with_uniform_path(free, left * values, hook)
     return with_simple_path(free, left * values, hook, points=points, denoised=noise > 0.0)
-
-
-def looks_rigid(values: NDArray[np.float64]) -> bool:
-    """Tell whether three directions explain the tracks so well that the object may be rigid."""
-    return bool(np.linalg.norm(values[3:]) < RIGID_REST * np.linalg.norm(values))
 
 
 def _trial(free: CameraEstimate, measurements: NDArray[np.float64]) -> Trial:

@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from smsr.errors import AnimationTooLarge
+from smsr.rotations import camera_scales
 
 if TYPE_CHECKING:
     import os
@@ -595,7 +596,7 @@ def _quantise(values: Array, span: float) -> NDArray[np.int16]:
 def _upright(camera: Array, *, down: bool) -> NDArray[np.float64]:
     """Return the rotation (3, 3) from the object frame to x right, y up, z towards the viewer."""
     rows = np.asarray(camera, np.float64)
-    right, v = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    right, v = rows / camera_scales(rows[None])[0]
     up = -v if down else v
     return np.stack([right, up, np.cross(right, up)])
 

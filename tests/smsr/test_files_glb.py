@@ -239,9 +239,13 @@ def test_the_first_camera_looks_at_it_from_the_front() -> None:
 
 
 def test_the_scale_of_the_camera_does_not_matter() -> None:
-    plain = glb(SHAPES, EXAMPLE.faces)
-    near = glb(SHAPES, EXAMPLE.faces, camera=2.0 * EXAMPLE.cameras[0])
-    assert b"".join(near.pieces()) == b"".join(plain.pieces())
+    near, nearer = (
+        glb(SHAPES, EXAMPLE.faces, camera=scale * EXAMPLE.cameras[0]) for scale in (2.0, 4.0)
+    )
+    assert b"".join(nearer.pieces()) == b"".join(near.pieces())
+    nodes = [document(b"".join(one.pieces()))[0]["nodes"] for one in (near, glb(SHAPES))]
+    rotations = [node["rotation"] for (node,) in nodes]
+    np.testing.assert_allclose(*rotations, atol=1e-12)
 
 
 def test_pixels_are_told_by_their_signs(tmp_path: Path) -> None:

@@ -49,7 +49,16 @@ class TestEstimate:
         W = make_low_rank(60, 40, 2).measurements
         left, values = factors(W)
         assert estimate_noise(values, 120, 40) < 1e-9
-        assert virtual_points(left, values, 40).noise == 0.0
+        points = virtual_points(left, values, 40)
+        assert points.noise == 0.0
+        assert points.neglected < 1e-9
+
+    def test_noise_that_is_left_in_is_told(self) -> None:
+        W = make_low_rank(60, 40, 2, noise=0.001).measurements
+        points = virtual_points(*factors(W), 40)
+        assert points.noise == 0.0
+        assert points.leading(5).neglected == pytest.approx(0.001, rel=0.25)
+        assert virtual_points(*factors(W[:10]), 40).neglected == np.inf
 
     @pytest.mark.parametrize(("frames", "points"), [(5, 40), (40, 5)])
     def test_too_small_a_matrix_tells_nothing(self, frames: int, points: int) -> None:

@@ -494,6 +494,23 @@ class TestDegenerateInput:
             np.testing.assert_allclose(other, shape, atol=2e-2)
         assert result.diagnostics.basis_size == 1
 
+    @pytest.mark.parametrize(
+        ("frames", "points", "noise", "degrees"), [(60, 30, 0.0028, 0.3), (6, 200, 0.01, 5.0)]
+    )
+    def test_noise_that_is_left_in_is_no_deformation(
+        self, frames: int, points: int, noise: float, degrees: float
+    ) -> None:
+        """Too little to be taken off, or too few frames to tell."""
+        rng = np.random.default_rng(0)
+        shape = rng.standard_normal((3, points))
+        shape -= shape.mean(axis=1, keepdims=True)
+        shapes = np.repeat(shape[None], frames, axis=0)
+        W = (turning(frames, degrees)[:, :2] @ shapes).reshape(2 * frames, points)
+        W += noise * W.std() * rng.standard_normal(W.shape)
+        result = reconstruct(W)
+        assert result.diagnostics.camera_model == "rigid"
+        assert evaluate(shapes, result, frame="object").e3d < 0.04
+
     def test_an_object_that_hardly_deforms_does_deform(self) -> None:
         """One shape for all frames leaves half a percent here."""
         rng = np.random.default_rng(0)

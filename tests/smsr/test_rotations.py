@@ -69,3 +69,17 @@ def test_spread_of_views_is_the_widest_angle(degrees: float) -> None:
     angles = np.radians(degrees) * np.array([0.3, 0.0, 0.9, 1.0, 0.5])
     rotations = so3.exp(angles[:, None] * np.array([0.0, 1.0, 0.0])) @ random_rotations(1)
     assert so3.spread_of_views(rotations) == pytest.approx(np.radians(degrees), abs=1e-7)
+
+
+def test_scales_are_the_lengths_of_rows() -> None:
+    cameras = random_rotations(5)[:, :2]
+    scales = np.array([0.5, 1.0, 1.5, 2.0, 0.0])
+    found = so3.camera_scales(scales[:, None, None] * cameras)
+    np.testing.assert_allclose(found, scales, atol=1e-12)
+    assert (found > 0.0).all()  # so that they can be divided by
+
+
+def test_scales_of_rounded_cameras_are_one() -> None:
+    np.testing.assert_array_equal(
+        so3.camera_scales(random_rotations(5)[:, :2].round(5)), np.ones(5)
+    )

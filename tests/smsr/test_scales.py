@@ -180,6 +180,27 @@ class TestReconstruction:
         result = reconstruct(image(BODY, TURN, scales), camera_scale="varying")
         np.testing.assert_allclose(result.scales, scales, rtol=0.03)
 
+    def test_a_single_jump_stays(self) -> None:
+        """However long the sequence is, and beside scales that change smoothly."""
+        frames = 200
+        scales = approach(frames) * np.where(np.arange(frames) < 120, 1.0, 1.5)
+        scales /= np.exp(np.log(scales).mean())
+        W = image(limbs(frames), turning(frames, 3.0), scales)
+        result = reconstruct(W, camera_scale="varying")
+        np.testing.assert_allclose(result.scales, scales, rtol=0.03)
+
+    def test_noise_that_is_given_is_that_of_the_tracks(self) -> None:
+        scales = approach(FRAMES, 8.0)
+        noise = 0.02
+        W = image(BODY, TURN, scales)
+        W += noise * np.random.default_rng(0).standard_normal(W.shape)
+        told = reconstruct(W, camera_scale="varying", noise=noise)
+        assert told.diagnostics.noise == pytest.approx(noise)
+        estimated = reconstruct(W, camera_scale="varying")
+        assert estimated.diagnostics.noise == pytest.approx(noise, rel=0.4)
+        errors = [evaluate(BODY, one, frame="object").e3d for one in (told, estimated)]
+        assert max(errors) < 1.2 * min(errors)
+
     def test_a_rigid_object_is_exact(self) -> None:
         rigid = np.repeat(BODY[:1], FRAMES, axis=0)
         result = reconstruct(image(rigid, TURN, approach(FRAMES)), camera_scale="varying")
@@ -241,12 +262,18 @@ class TestDegenerate:
         assert np.isfinite(result.shapes).all()
         np.testing.assert_allclose(result.scales, approach(FRAMES), rtol=0.15)
 
-    def test_frames_in_which_all_points_coincide(self) -> None:
+    @pytest.mark.parametrize("frames", [(10, 12), (0, 31), (12, 57)])
+    def test_frames_in_which_all_points_coincide(self, frames: tuple[int, int]) -> None:
+        """Their scales are those of their neighbours; the others are as they would be."""
         W = image(BODY, TURN, approach(FRAMES))
-        W[20:24] = 0.0
+        W[2 * frames[0] : 2 * frames[1]] = 7.0
         result = reconstruct(W, camera_scale="varying")
         assert np.isfinite(result.shapes).all()
         assert np.isfinite(result.cameras).all()
+        seen = np.ones(FRAMES, dtype=bool)
+        seen[slice(*frames)] = False
+        ratios = np.log(result.scales / approach(FRAMES))[seen]
+        assert np.ptp(ratios) < 0.5
 
 
 def codes(result: Reconstruction) -> set[str]:

@@ -66,6 +66,7 @@ export interface Metrics {
   e3d: number;
   e3d_per_frame?: number;
   relative_rms?: number;
+  scale?: number;
   per_frame?: number[];
   frame?: "object" | "camera";
 }

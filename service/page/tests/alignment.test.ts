@@ -116,6 +116,9 @@ describe("aligning ground truth", () => {
       const aligned = alignTruth(larger, { frames, points }, shown, scaled, frame)!;
       for (let t = 0; t < frames; t += 1) expectClose(aligned.frames[t], shapes[t], 4);
       for (const error of aligned.errors) expect(error).toBeLessThan(1e-5);
+      expect(aligned.sigma).toBeCloseTo(
+        alignTruth(truth, { frames, points }, shown, cameras, frame)!.sigma,
+      );
       const charged = alignTruth(larger, { frames, points }, shown, cameras, frame)!;
       expect(Math.min(...charged.errors)).toBeGreaterThan(0.1);
     },

@@ -119,12 +119,12 @@ function truthIndex(
 function scaleOf(cameras: ArrayLike<number>, frame: number): number {
   let squares = 0;
   for (let k = 0; k < 6; k += 1) squares += cameras[6 * frame + k] ** 2;
-  return Math.sqrt(squares / 2);
+  return Math.sqrt(squares / 2) || 1;
 }
 
 function scalesVary(cameras: ArrayLike<number>): boolean {
   for (let t = 0; 6 * t < cameras.length; t += 1) {
-    if (Math.abs(scaleOf(cameras, t) - 1) > 1e-6) return true;
+    if (Math.abs(scaleOf(cameras, t) - 1) > 1e-4) return true;
   }
   return false;
 }
@@ -143,7 +143,7 @@ export function rotationOf(cameras: ArrayLike<number>, frame: number): Matrix3 {
 export interface AlignedTruth {
   /** Each shown frame's true points, (K, 3), centred and turned onto the shapes. */
   frames: Float32Array[];
-  /** Mean standard deviation of the true coordinates, the unit of e3D. */
+  /** Mean standard deviation of the true coordinates at the size of the shapes, the unit of e3D. */
   sigma: number;
   /** Mean distance in each shown frame in units of sigma: its part of e3D. */
   errors: number[];
@@ -210,14 +210,16 @@ export function alignTruth(
     centred.push(G);
   }
   const Q = orthogonalFactor(cross);
-  const scale = scalesVary(cameras) ? Q.reduce((sum, q, k) => sum + q * cross[k], 0) / size : 1;
-  const sigma = deviations / shown.shapes.length;
+  const scale = scalesVary(cameras)
+    ? Q.reduce((sum, q, k) => sum + q * cross[k], 0) / (size || 1)
+    : 1;
+  const sigma = deviations / shown.shapes.length / scale;
   const errors: number[] = [];
   for (let k = 0; k < centred.length; k += 1) {
     // G ~ Q R X, so that R^T Q^T G lies on X.
     const turn = frame === "camera" ? product(Q, rotationOf(cameras, shown.frameNumbers[k])) : Q;
     for (let i = 0; i < centred[k].length; i += 1) centred[k][i] /= scale;
-    errors.push((scale * turnOnto(centred[k], turn, shown.shapes[k])) / (sigma * count));
+    errors.push(turnOnto(centred[k], turn, shown.shapes[k]) / (sigma * count));
   }
   return { frames: centred, sigma, errors };
 }
