@@ -244,8 +244,8 @@ def test_the_scale_of_the_camera_does_not_matter() -> None:
     )
     assert b"".join(nearer.pieces()) == b"".join(near.pieces())
     nodes = [document(b"".join(one.pieces()))[0]["nodes"] for one in (near, glb(SHAPES))]
-    rotations = [node["rotation"] for (node,) in nodes]
-    np.testing.assert_allclose(*rotations, atol=1e-12)
+    scaled, plain = (node["rotation"] for (node,) in nodes)
+    np.testing.assert_allclose(scaled, plain, atol=1e-12)
 
 
 def test_pixels_are_told_by_their_signs(tmp_path: Path) -> None:
