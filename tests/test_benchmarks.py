@@ -84,3 +84,19 @@ def test_a_batch_is_looked_at_and_dealt_with() -> None:
     measured = [" ".join(row).split("|")[2] for row in rows[3:]]
     assert len(measured) == 9
     assert all(int(milliseconds) >= 0 for milliseconds in measured)
+
+
+@pytest.mark.data
+def test_camera_scale(tmp_path: Path) -> None:
+    data = Path(os.environ.get("SMSR_DATA", ROOT.parent / "shared" / "data"))
+    if not data.is_dir():
+        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+    few = ("--shapes", "yoga", "--paths", "fast", "--noises", "0.01", "--processes", "1")
+    report = tmp_path / "scale.json"
+    rows = run("camera_scale.py", "--data", str(data), "--json", str(report), *few)
+    assert rows[0][1:4] == ["noise", "|", "path"]
+    (member,) = json.loads(report.read_text())
+    for frame in ("object", "camera"):
+        errors = member[frame]
+        assert errors["scaled, varying"] < 0.5 * errors["scaled, constant"]
+        assert errors["pinhole, varying"] < 0.8 * errors["pinhole, constant"]
