@@ -14,17 +14,20 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from smsr.benchmark.camera_paths import PATHS, SHAPES, geometric_mean, keys, tracks
+from smsr.benchmark.camera_paths import (
+    PATHS,
+    SHAPES,
+    geometric_mean,
+    keys,
+    of_each_member,
+    tracks,
+)
 from smsr.metrics import evaluate
 from smsr.pipeline import reconstruct
 
@@ -115,10 +118,6 @@ def table(members: list[Member]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _one_thread() -> None:
-    threadpool_limits(limits=1)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=os.environ.get("SMSR_DATA"))
@@ -131,8 +130,7 @@ def main() -> None:
     if chosen.data is None or not chosen.data.is_dir():
         parser.error("the evaluation data are needed: --data FOLDER or SMSR_DATA")
     which = keys(chosen.shapes, chosen.paths, chosen.noises)
-    with ProcessPoolExecutor(chosen.processes, get_context("spawn"), _one_thread) as pool:
-        members = list(pool.map(partial(measure, chosen.data), which))
+    members = list(of_each_member(measure, chosen.data, which, chosen.processes))
     print(table(members))
     if chosen.json:
         report = [asdict(one) for one in members]

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from smsr.errors import SmsrError
 from smsr.options import Options
-from smsr.progress import Progress, ProgressCallback
+from smsr.progress import STAGES, Progress, ProgressCallback
 
 if TYPE_CHECKING:
     from smsr.metrics import Evaluation, evaluate
-    from smsr.pipeline import STAGES, reconstruct
+    from smsr.pipeline import reconstruct
     from smsr.result import Diagnostics, MovingSurface, Reconstruction
 
 __version__ = "0.1.0"
@@ -33,7 +33,6 @@ __all__ = [
 # Programs that never solve, as an API process or a client, need not load SciPy for the names of
 # errors and options: what needs it is loaded when it is first asked for (PEP 562).
 _LOADED_LATER = {
-    "STAGES": "smsr.pipeline",
     "reconstruct": "smsr.pipeline",
     "Evaluation": "smsr.metrics",
     "evaluate": "smsr.metrics",

@@ -16,7 +16,7 @@ import numpy as np
 
 from smsr.errors import FiguresUnavailable, NothingToDraw
 from smsr.files.glb import v_grows_down
-from smsr.rotations import camera_scales
+from smsr.rotations import camera_scales, complete
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -119,8 +119,7 @@ class FigureSource:
         cameras = cameras / camera_scales(cameras)[:, None, None]
         if self.down:
             cameras[:, 1] *= -1.0
-        depth = np.cross(cameras[:, 0], cameras[:, 1])
-        return np.concatenate([cameras, depth[:, None]], axis=1)
+        return complete(cameras)
 
     def frame(self, t: int, step: int) -> NDArray[np.float64]:
         """Read every `step`-th point of frame t, a window at a time."""

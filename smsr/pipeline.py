@@ -33,7 +33,7 @@ from smsr.lengths import chosen_points
 from smsr.lifting import denoised_lifting, exact_lifting, smoothed_lifting
 from smsr.measurements import as_source
 from smsr.options import Options, parse, resolve
-from smsr.progress import Progress, part_of
+from smsr.progress import STAGES, Progress, part_of
 from smsr.reduction import Reduction
 from smsr.result import Diagnostics, Reconstruction, StageReport
 from smsr.rotations import angles_between
@@ -59,9 +59,6 @@ if TYPE_CHECKING:
     from smsr.scales import ScaleEstimate
     from smsr.shapes import ShapeEstimate
     from smsr.trajectories import SmoothMotion
-
-STAGES = ("reading", "factorising", "scales", "cameras", "smoothing", "shapes", "writing")
-"""Names of the stages, in order."""
 
 _SHARES = {
     "constant": dict(zip(STAGES, (0.02, 0.23, 0.0, 0.25, 0.05, 0.20, 0.25), strict=True)),

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
+STAGES = ("reading", "factorising", "scales", "cameras", "smoothing", "shapes", "writing")
+"""Names of the stages of a run, in order."""
+
 
 @dataclass(frozen=True, slots=True)
 class Progress:
@@ -14,7 +17,7 @@ class Progress:
     Attributes
     ----------
     stage : str
-        Name of the stage, one of `smsr.pipeline.STAGES`.
+        Name of the stage, one of `STAGES`.
     fraction : float
         Part of the whole run that is done, 0 to 1, never decreasing within a run.
     iteration : int

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smsr.rotations import camera_scales
+from smsr.rotations import camera_scales, complete
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,7 +23,7 @@ class StageReport:
     Attributes
     ----------
     name : str
-        One of `smsr.pipeline.STAGES`.
+        One of `smsr.progress.STAGES`.
     seconds : float
         Wall time.
     iterations : int
@@ -152,9 +152,7 @@ class MovingSurface:
 
         That is the cross product of the rows.
         """
-        cameras = self.cameras / self.scales[:, None, None]
-        depth = np.cross(cameras[:, 0], cameras[:, 1])
-        return np.concatenate([cameras, depth[:, None]], axis=1)
+        return complete(self.cameras / self.scales[:, None, None])
 
     def in_camera_frame(self) -> NDArray[np.floating[Any]]:
         """Return the shapes (T, N, 3) turned into the camera frame of each frame, R3_t S_t."""

@@ -21,8 +21,12 @@ import numpy as np
 from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import maximum_filter1d
 
-from smsr.cameras.constraints import OrthonormalityForm, frame_products, orthonormality_form
-from smsr.cameras.estimate import scaled_motion, usable_rank
+from smsr.cameras.constraints import (
+    OrthonormalityForm,
+    mean_square_length,
+    orthonormality_form,
+)
+from smsr.cameras.estimate import corrective_matrix, scaled_motion, usable_rank
 from smsr.cameras.relaxed import relaxed_factor
 from smsr.lengths import chosen_points
 from smsr.progress import ignore, part_of
@@ -115,7 +119,7 @@ def varying_scales(
     )
     seen = sizes > _UNSEEN * sizes.max()
     scales = _interpolated(sizes, seen)
-    chosen = chosen_points(space.divided(scales).sample, _MOST_POINTS)
+    chosen = chosen_points(space.sample / np.repeat(scales, 2)[:, None], _MOST_POINTS)
     hooks = [
         part_of(hook, k / (MOST_ROUNDS + 1), (k + 1) / (MOST_ROUNDS + 1))
         for k in range(MOST_ROUNDS + 1)
@@ -165,17 +169,14 @@ def relaxed_scales(reduction: Reduction, hook: StageHook = ignore) -> NDArray[np
     motion = scaled_motion(
         reduction.left, reduction.values, usable_rank(reduction.values, 3 * _BASIS_SIZE)
     )
-    uu, vv, _ = frame_products(motion)
-    lengths = 0.5 * (uu + vv)
-    mean, frames = lengths.mean(axis=0), len(lengths)
+    mean, frames = mean_square_length(motion), len(motion) // 2
     equal = orthonormality_form(motion, unit_scale=False)
     form = OrthonormalityForm(
         equal.hessian + frames * np.outer(mean, mean), frames * mean, float(frames)
     )
     F, _ = relaxed_factor(motion, trace_weight=_TRACE_WEIGHT, form=form, hook=hook)
-    strengths, vectors = np.linalg.eigh(F)
-    Q = vectors[:, -3:] * np.sqrt(np.maximum(strengths[-3:], 0.0))
-    return _normalised(np.linalg.norm((motion @ Q).reshape(frames, -1), axis=1))
+    rows = (motion @ corrective_matrix(F)).reshape(frames, -1)
+    return _normalised(np.linalg.norm(rows, axis=1))
 
 
 def common_scales(shapes: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -48,12 +48,9 @@ def test_the_reduction_computes_the_same_as_the_whole() -> None:
 
 
 @pytest.mark.data
-def test_camera_paths(tmp_path: Path) -> None:
-    data = Path(os.environ.get("SMSR_DATA", ROOT.parent / "shared" / "data"))
-    if not data.is_dir():
-        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+def test_camera_paths(tmp_path: Path, evaluation_data: Path) -> None:
     few = ("--shapes", "yoga", "--paths", "fast", "--noises", "0.01", "--processes", "1")
-    run("camera_paths.py", "--data", str(data), "--out", str(tmp_path / "paths"), *few)
+    run("camera_paths.py", "--data", str(evaluation_data), "--out", str(tmp_path / "paths"), *few)
     (member,) = json.loads((tmp_path / "paths.json").read_text())
     assert member["model"] == "uniform"
     assert member["default"]["object"] < member["baseline"]["object"]
@@ -61,14 +58,11 @@ def test_camera_paths(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
-def test_missing_data(tmp_path: Path) -> None:
-    data = Path(os.environ.get("SMSR_DATA", ROOT.parent / "shared" / "data"))
-    if not data.is_dir():
-        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+def test_missing_data(tmp_path: Path, evaluation_data: Path) -> None:
     out = tmp_path / "missing.json"
     cases = ("all seen", "30% at random", "5% errors, reject")
     few = ("--sets", "yoga", "--draws", "1", "--json", str(out), "--cases", *cases)
-    rows = run("missing_data.py", "--data", str(data), *few)
+    rows = run("missing_data.py", "--data", str(evaluation_data), *few)
     assert len(rows) == 2 + len(cases)
     clean, gaps, errors = json.loads(out.read_text())
     assert 0.25 < gaps["missing"] < 0.35
@@ -87,13 +81,10 @@ def test_a_batch_is_looked_at_and_dealt_with() -> None:
 
 
 @pytest.mark.data
-def test_camera_scale(tmp_path: Path) -> None:
-    data = Path(os.environ.get("SMSR_DATA", ROOT.parent / "shared" / "data"))
-    if not data.is_dir():
-        pytest.skip("the evaluation data are not here (SMSR_DATA or ../shared/data)")
+def test_camera_scale(tmp_path: Path, evaluation_data: Path) -> None:
     few = ("--shapes", "yoga", "--paths", "fast", "--noises", "0.01", "--processes", "1")
     report = tmp_path / "scale.json"
-    rows = run("camera_scale.py", "--data", str(data), "--json", str(report), *few)
+    rows = run("camera_scale.py", "--data", str(evaluation_data), "--json", str(report), *few)
     assert rows[0][1:4] == ["noise", "|", "path"]
     (member,) = json.loads(report.read_text())
     for frame in ("object", "camera"):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from itertools import product
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
     Array: TypeAlias = NDArray[np.float64]
     Key: TypeAlias = tuple[str, str, float]
+
+T = TypeVar("T")
 
 SHAPES: Final[Mapping[str, tuple[str, str]]] = {
     "drink": ("sparse/drink.mat", "S"),
@@ -322,9 +324,16 @@ def measure_member(folder: Path, key: Key) -> Member:
 
 def measure_members(folder: Path, members: Sequence[Key], processes: int = 1) -> Iterator[Member]:
     """Measure members of the family, several at a time with one BLAS thread each, in order."""
+    return of_each_member(measure_member, folder, members, processes)
+
+
+def of_each_member(
+    measure: Callable[[Path, Key], T], folder: Path, members: Sequence[Key], processes: int
+) -> Iterator[T]:
+    """Return what a function of a module finds of each member, as `measure_members` does."""
     context = get_context("spawn")  # threads of the caller's may hold locks
     with ProcessPoolExecutor(processes, context, _one_thread) as pool:
-        yield from pool.map(partial(measure_member, folder), members)
+        yield from pool.map(partial(measure, folder), members)
 
 
 def _one_thread() -> None:

@@ -109,6 +109,11 @@ def frame_products(
     return uu, vv, uv
 
 
+def mean_square_length(motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vector (p,) whose product with svec(F) is the mean squared row length of M' Q."""
+    return symmetric_vector(motion.T @ motion) / len(motion)
+
+
 _FRAMES_AT_ONCE = 512
 
 

@@ -86,6 +86,13 @@ def scaled_motion(
     return scaled
 
 
+def corrective_matrix(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return Q (n, 3) of F = Q Q^T (n, n), of the three leading eigenvectors; (n, n) for n < 3."""
+    values, vectors = np.linalg.eigh(F)
+    Q: NDArray[np.float64] = vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 1e-12))
+    return Q
+
+
 def cameras_from_factor(motion: NDArray[np.float64], F: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rotations (T, 3, 3) from F = Q Q^T: the cameras nearest to M' Q.
 
@@ -96,8 +103,7 @@ def cameras_from_factor(motion: NDArray[np.float64], F: NDArray[np.float64]) -> 
     F : ndarray of shape (n, n)
         Semi-definite; Q is made of its three leading eigenvectors.
     """
-    values, vectors = np.linalg.eigh(F)
-    Q = vectors[:, -3:] * np.sqrt(np.maximum(values[-3:], 1e-12))
+    Q = corrective_matrix(F)
     rows = np.zeros((len(motion), 3))
     rows[:, -Q.shape[1] :] = motion @ Q
     return so3.complete(so3.nearest_cameras(rows.reshape(-1, 2, 3)))

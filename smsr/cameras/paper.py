@@ -6,7 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smsr.cameras.constraints import orthonormality_form, symmetric_matrix, symmetric_vector
+from smsr.cameras.constraints import (
+    mean_square_length,
+    orthonormality_form,
+    symmetric_matrix,
+    symmetric_vector,
+)
 from smsr.cameras.estimate import CameraEstimate, cameras_from_factor, scaled_motion, usable_rank
 from smsr.cameras.relaxed import relaxed_factor
 from smsr.progress import ignore
@@ -123,7 +128,7 @@ def thresholded_factor(
     frames = len(motion) // 2
     form = orthonormality_form(motion, unit_scale=False)
     lipschitz = form.lipschitz()
-    lengths = symmetric_vector(motion.T @ motion) / len(motion)
+    lengths = mean_square_length(motion)
     f = symmetric_vector(nearest_semidefinite(start, 3))
     f = _scaled(f, lengths)
     changes: list[float] = []

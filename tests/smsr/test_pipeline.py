@@ -16,7 +16,7 @@ from smsr.benchmark.camera_paths import errors
 from smsr.cameras import estimate_cameras, fix_gauge
 from smsr.errors import Cancelled, InvalidOption, UnknownOption
 from smsr.options import Options, resolve
-from smsr.pipeline import STAGES
+from smsr.progress import STAGES
 from smsr.rotations import complete
 from smsr.shapes import estimate_shapes, planar_shapes
 from smsr.synthetic import make_example, make_low_rank

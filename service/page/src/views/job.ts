@@ -266,7 +266,7 @@ function accuracyCard(job: Job): HTMLElement {
     facts([
       ["Each frame aligned", metrics?.e3d_per_frame ? precise(metrics.e3d_per_frame) : null],
       ["Compared in", metrics?.frame ? `the ${metrics.frame} frame` : null],
-      ["Scale fitted", (metrics?.scale ?? 1) !== 1 ? precise(metrics!.scale!) : null],
+      ["Scale fitted", metrics?.scale && metrics.scale !== 1 ? precise(metrics.scale) : null],
       ["Camera", diagnostics?.camera_model],
       ["Basis shapes", diagnostics ? String(diagnostics.basis_size) : null],
       ["Converged", diagnostics ? (diagnostics.converged ? "yes" : "no") : null],
