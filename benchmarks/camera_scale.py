@@ -15,6 +15,7 @@ import argparse
 import json
 import os
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -130,7 +131,7 @@ def main() -> None:
     if chosen.data is None or not chosen.data.is_dir():
         parser.error("the evaluation data are needed: --data FOLDER or SMSR_DATA")
     which = keys(chosen.shapes, chosen.paths, chosen.noises)
-    members = list(of_each_member(measure, chosen.data, which, chosen.processes))
+    members = list(of_each_member(partial(measure, chosen.data), which, chosen.processes))
     print(table(members))
     if chosen.json:
         report = [asdict(one) for one in members]

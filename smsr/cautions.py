@@ -32,7 +32,7 @@ _LITTLE_ROTATION = math.radians(10.0)
 
 
 def input_cautions(
-    values: NDArray[np.float64], solved: VirtualPoints, points: int
+    values: NDArray[np.float64], solved: VirtualPoints, points: int, *, flat: bool = False
 ) -> list[Caution]:
     """Judge the singular values of the measurements.
 
@@ -44,10 +44,15 @@ def input_cautions(
         What of them was solved for.
     points : int
         N.
+    flat : bool
+        Whether the object was seen to be flat but for its deformation: then few directions are no
+        reason to doubt its depth, or that it deforms.
     """
     found = []
     rows, kept = len(solved.left), len(solved.values)
-    if _part_beyond(values, 2) < _FLAT:
+    if flat:
+        pass
+    elif _part_beyond(values, 2) < _FLAT:
         found.append(
             Caution(
                 "near-planar",
@@ -116,6 +121,16 @@ def camera_cautions(rotations: NDArray[np.float64], estimate: CameraEstimate) ->
                 "little-rotation",
                 f"The camera turns by {math.degrees(spread):.1f} degrees only around the object, "
                 "so depth is uncertain. Tracks over more frames or with more motion would help.",
+            )
+        )
+    views = round(estimate.criteria.get("frontal_views", 0.0))
+    if estimate.model == "flat" and views > 0:
+        found.append(
+            Caution(
+                "reversals",
+                "The object is flat but for its deformation, and it is seen from the front "
+                f"{'once' if views == 1 else f'{views} times'}. The tracks hardly tell which of "
+                "its sides tilts away after that: it may be mirrored in depth from there on.",
             )
         )
     disagreement = estimate.criteria.get("disagreement", 0.0)

@@ -91,3 +91,12 @@ def test_camera_scale(tmp_path: Path, evaluation_data: Path) -> None:
         errors = member[frame]
         assert errors["scaled, varying"] < 0.5 * errors["scaled, constant"]
         assert errors["pinhole, varying"] < 0.8 * errors["pinhole, constant"]
+
+
+def test_sheets(tmp_path: Path) -> None:
+    few = ("--sheets", "flag", "--paths", "fast", "--seeds", "1", "--noises", "0.01")
+    report = tmp_path / "sheets.json"
+    rows = run("sheets.py", "--json", str(report), "--processes", "1", *few)
+    assert rows[2][:4] == ["|", "1%", "|", "flag"]
+    (member,) = json.loads(report.read_text())
+    assert member["default"]["camera"] < 0.5 * member["baseline"]["camera"]

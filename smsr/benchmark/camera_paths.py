@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     Array: TypeAlias = NDArray[np.float64]
     Key: TypeAlias = tuple[str, str, float]
 
+K = TypeVar("K")
 T = TypeVar("T")
 
 SHAPES: Final[Mapping[str, tuple[str, str]]] = {
@@ -304,9 +305,19 @@ def with_true_cameras(W: Array, rotations: Array) -> Array:
     return lifting.apply(W - space.means[:, None])
 
 
-def measure_member(folder: Path, key: Key) -> Member:
-    """Make one member and reconstruct it in the three ways."""
-    W, rotations, true = tracks(folder, key)
+def compared(key: Key, W: Array, rotations: Array, true: Array) -> Member:
+    """Reconstruct tracks in the three ways.
+
+    Parameters
+    ----------
+    key
+        What the tracks are called.
+    W : ndarray of shape (2T, N)
+    rotations : ndarray of shape (T, 3, 3)
+        True cameras.
+    true : ndarray of shape (T, 3, N)
+        True shapes, centred.
+    """
     plain = reconstruct(W, camera_model="relaxed", basis_size=10, shape_method="nuclear", noise=0.0)
     start = time.process_time()
     result = reconstruct(W)
@@ -322,18 +333,21 @@ def measure_member(folder: Path, key: Key) -> Member:
     )
 
 
+def measure_member(folder: Path, key: Key) -> Member:
+    """Make one member and reconstruct it in the three ways."""
+    return compared(key, *tracks(folder, key))
+
+
 def measure_members(folder: Path, members: Sequence[Key], processes: int = 1) -> Iterator[Member]:
     """Measure members of the family, several at a time with one BLAS thread each, in order."""
-    return of_each_member(measure_member, folder, members, processes)
+    return of_each_member(partial(measure_member, folder), members, processes)
 
 
-def of_each_member(
-    measure: Callable[[Path, Key], T], folder: Path, members: Sequence[Key], processes: int
-) -> Iterator[T]:
+def of_each_member(measure: Callable[[K], T], members: Sequence[K], processes: int) -> Iterator[T]:
     """Return what a function of a module finds of each member, as `measure_members` does."""
     context = get_context("spawn")  # threads of the caller's may hold locks
     with ProcessPoolExecutor(processes, context, _one_thread) as pool:
-        yield from pool.map(partial(measure, folder), members)
+        yield from pool.map(measure, members)
 
 
 def _one_thread() -> None:

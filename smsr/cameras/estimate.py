@@ -24,8 +24,8 @@ class CameraEstimate:
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     model : str
-        How they were found: 'relaxed', 'uniform', 'switched', 'accelerated', 'eased', 'swinging',
-        'axis', 'gimbal', 'rigid' or 'paper'.
+        How they were found: 'relaxed', 'flat', 'uniform', 'switched', 'accelerated', 'eased',
+        'swinging', 'axis', 'gimbal', 'rigid' or 'paper'.
     basis_size : int
         K, the number of column triplets of the corrective matrix.
     iterations : int
@@ -39,6 +39,8 @@ class CameraEstimate:
     criteria : mapping
         Numbers that the choice was based on, see `smsr.cameras.free` and
         `smsr.cameras.selection`.
+    flat : bool
+        Whether they come from a flat mean shape, see `smsr.cameras.flat`.
     coherent : bool
         Whether a simple path of the camera made the object move no more.
     simpler : ndarray of shape (T, 3, 3), optional
@@ -60,6 +62,7 @@ class CameraEstimate:
     reason: str
     residuals: tuple[float, ...] = ()
     criteria: Mapping[str, float] = field(default_factory=dict)
+    flat: bool = False
     coherent: bool = False
     simpler: NDArray[np.float64] | None = None
     simpler_share: float = 0.0

@@ -16,6 +16,7 @@ import numpy as np
 from smsr import rotations as so3
 from smsr.cameras.constraints import orthonormality_form
 from smsr.cameras.estimate import scaled_motion, usable_rank
+from smsr.cameras.flat import flat_views, steadier
 from smsr.cameras.relaxed import relaxed_cameras
 from smsr.progress import ignore, part_of
 from smsr.shapes import DepthProblem
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smsr.cameras.estimate import CameraEstimate
+    from smsr.cameras.flat import FlatViews
     from smsr.progress import StageHook
 
 RELAXATIONS = ((10, 1e-3), (3, 1e-3), (2, 1e-3), (10, 4e-3), (10, 1.6e-2))
@@ -52,6 +54,20 @@ _CLEARLY_LOWER = 0.93
 
 _CREDIBLE = 0.75
 """Complexity above which those are taken only if the first one failed grossly (1)."""
+
+_NEARLY_RIGID = 0.15
+"""Complexity below which no flat mean shape is looked for."""
+
+_CLEARLY_SIMPLER, _FAR_SIMPLER = 0.8, 0.6
+_CREDIBLE_FLAT = 0.5
+_APART, _APART_IF_CERTAIN, _FAR_APART = np.radians([15.0, 20.0, 25.0]).tolist()
+"""Cameras of a flat mean shape are taken where their shapes are simple, and clearly simpler than
+those of the relaxations. Where the two nearly agree, the relaxed ones are more accurate. So they
+must be apart, the more so where these are certain, whatever reversals there may be; or far apart by
+reversals and much simpler."""
+
+_FRONTAL = math.sin(math.radians(30.0))
+"""Tilt of a plane below which the tracks hardly tell which side is up."""
 
 _AGREEMENT = math.radians(6.0)
 _AS_GOOD = 1.05  # relaxations of complexities within this factor are equally likely
@@ -91,7 +107,9 @@ def free_cameras(
     CameraEstimate
         Its criteria are ``complexity``, see there, and ``disagreement``, the largest root mean
         square angle in degrees to the cameras of a relaxation that is nearly as good, 0 where the
-        shapes are so simple that the cameras are certain.
+        shapes are so simple that the cameras are certain. Of a flat mean shape they are
+        ``relaxed_complexity``, that of the best relaxation, and ``frontal_views``, how often the
+        object is seen from the front, instead of the second.
     """
     most = max(1, len(values) // 3)
     share = min(noise / _NOISY, 1.0) ** 2
@@ -145,6 +163,10 @@ def free_cameras(
         if doubtful and other.complexity <= _AS_GOOD * best.complexity
     ]
     disagreement = math.degrees(max(angles, default=0.0))
+    if basis_size is None and best.complexity > _NEARLY_RIGID:
+        flat = _of_flat_shape(best, left, values)
+        if flat is not None:
+            return flat
     return dataclasses.replace(
         best.estimate,
         criteria={"complexity": best.complexity, "disagreement": disagreement},
@@ -157,6 +179,46 @@ class _Relaxation:
 
     estimate: CameraEstimate
     complexity: float
+
+
+def _of_flat_shape(
+    relaxed: _Relaxation, left: NDArray[np.float64], values: NDArray[np.float64]
+) -> CameraEstimate | None:
+    """Return the cameras of a flat mean shape where the relaxations failed on one."""
+    views = flat_views(left, values)
+    if views is None:
+        return None
+    measurements, before = left * values, relaxed.complexity
+    now = complexity(measurements, views.rotations)
+    if now >= before or _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
+        return None
+    views = steadier(views)
+    now = complexity(measurements, views.rotations)
+    if now >= _CLEARLY_SIMPLER * before or (now >= _CREDIBLE_FLAT and before <= 1.0):
+        return None
+    return dataclasses.replace(
+        relaxed.estimate,
+        rotations=views.rotations,
+        model="flat",
+        flat=True,
+        basis_size=1,
+        criteria={
+            "complexity": now,
+            "relaxed_complexity": before,
+            "frontal_views": float(len(views.frontal_frames(_FRONTAL))),
+        },
+        reason="the mean shape is flat, and cameras that see it as a plane give shapes that are "
+        f"{1.0 - now / before:.0%} simpler than those of the best {relaxed.estimate.reason}",
+    )
+
+
+def _is_the_same(views: FlatViews, relaxed: _Relaxation, *, far_simpler: bool) -> bool:
+    """Tell whether views of a plane nearly agree with relaxed cameras, which then are better."""
+    cameras = relaxed.estimate.rotations
+    limit = _APART if relaxed.complexity >= _CERTAIN else _APART_IF_CERTAIN
+    if angle_between(cameras, views.nearest_to(cameras).rotations) >= limit:
+        return False
+    return not far_simpler or angle_between(cameras, views.rotations) < _FAR_APART
 
 
 def _agree(first: _Relaxation, second: _Relaxation) -> bool:

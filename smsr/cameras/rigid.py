@@ -17,6 +17,10 @@ RIGID_REST = 0.002
 noise may have left the rest. More is deformation, however little, and seen well by the cameras and
 shapes of deforming objects."""
 
+_MISFIT = 0.1
+"""Root mean square of what the constraints of orthonormal rows may miss by. A flat object that
+deforms has three directions as well, but they are not those of a rigid one."""
+
 _MOST_REST = 0.02  # that noise may have left
 _ABOVE_NOISE = 1.2
 
@@ -51,8 +55,8 @@ def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> Cam
     Returns
     -------
     CameraEstimate or None
-        None where the measurements do not determine the upgrade: a flat object, or a camera that
-        does not turn.
+        None where the measurements do not determine the upgrade, for a flat object or a camera that
+        does not turn, or do not fit it.
     """
     if len(values) < 3 or len(left) < 6:
         return None
@@ -64,6 +68,8 @@ def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> Cam
     F = symmetric_matrix(solution)
     strengths = np.linalg.eigvalsh(F)
     if rank < 6 or strengths[0] <= 1e-6 * strengths[-1]:
+        return None
+    if ((constraints @ solution - lengths) ** 2).sum() > _MISFIT**2 * len(uu):
         return None
     return CameraEstimate(
         rotations=cameras_from_factor(motion, F),

@@ -118,7 +118,8 @@ def estimate_cameras(
 def _trial(free: CameraEstimate, measurements: NDArray[np.float64]) -> Trial:
     """Return the free cameras on some frames and directions: paths have few parameters."""
     step = math.ceil(len(free.rotations) / _FRAMES)
-    return Trial(every_frame(measurements, step)[:, :_DIRECTIONS], free.rotations, step)
+    some = every_frame(measurements, step)[:, :_DIRECTIONS]
+    return Trial(some, free.rotations, step, flat=free.flat)
 
 
 def with_uniform_path(
@@ -196,7 +197,7 @@ def with_simple_path(
         outside = part_outside_span(measurements, turn.rotations)
         criteria[f"{path.name}_outside_span"] = outside
         limit = max(SPAN_LIMIT, part_outside_span(measurements, free.rotations))
-        if outside > limit and not denoised:
+        if outside > limit and not denoised and not trial.flat:
             reasons.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
             continue
         return _on_path(free, path, turn, verdict, criteria)
@@ -264,7 +265,8 @@ def part_outside_span(measurements: NDArray[np.float64], rotations: NDArray[np.f
     """Return how much of the cameras no combination of the leading directions of W explains.
 
     Where the deformation is a sum of basis shapes, W = R (C kron I_3) B, and the mean shape is one
-    of them, the columns of R themselves lie in the column space of W. Wrong cameras do not.
+    of them, the columns of R themselves lie in the column space of W. Wrong cameras do not, nor the
+    third column of right ones where the mean shape is flat.
 
     Parameters
     ----------

@@ -39,6 +39,10 @@ UNEXPLAINED_LITTLE = 0.035
 MOTION_RISE_LIMIT = 0.35
 """By how much more: log of the ratio of ||D S#||^2."""
 
+FLAT_LIMITS = (0.1, 0.5)
+"""The same two limits where the cameras are those of a flat mean shape: they follow its turns, so
+they drift more, and let it move less."""
+
 NODDING_LIMITS = (0.02, 0.16)
 """The same two limits for a path with a nod, which fits much that it should not."""
 
@@ -152,14 +156,22 @@ class Trial:
         Free cameras of all frames.
     step : int
         n.
+    flat : bool
+        Whether they are those of a flat mean shape.
     """
 
     def __init__(
-        self, measurements: NDArray[np.float64], rotations: NDArray[np.float64], step: int
+        self,
+        measurements: NDArray[np.float64],
+        rotations: NDArray[np.float64],
+        step: int,
+        *,
+        flat: bool = False,
     ) -> None:
         self.measurements = measurements
         self.rotations = rotations
         self.step = step
+        self.flat = flat
         self._free = self._solve(rotations[::step])
 
     def come_to_rest(self, points: NDArray[np.float64]) -> tuple[float, float]:
@@ -236,7 +248,7 @@ class Trial:
         if unexplained > most:
             return Verdict(unexplained, f"leaves {unexplained:.1%} of the rotation unexplained")
         verdict = self.measure(path)
-        little, rise = (UNEXPLAINED_LITTLE, MOTION_RISE_LIMIT)
+        little, rise = FLAT_LIMITS if self.flat else (UNEXPLAINED_LITTLE, MOTION_RISE_LIMIT)
         if path.nods:
             little, rise = NODDING_LIMITS
         if (verdict.motion_rise or 0.0) <= (rise if unexplained <= little else 0.0):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smsr import rotations as so3
+from smsr.benchmark.camera_paths import lissajous
+from smsr.benchmark.sheets import SHEETS, sheet_tracks
 from smsr.cameras.axis import fit_axis
 from smsr.cameras.constraints import (
     frame_products,
@@ -16,6 +19,7 @@ from smsr.cameras.constraints import (
     symmetric_vector,
 )
 from smsr.cameras.estimate import CameraEstimate, scaled_motion, usable_rank
+from smsr.cameras.flat import FEWEST_FRAMES, FlatViews, flat_views, smoothest_signs, steadier
 from smsr.cameras.free import angle_between, complexity, free_cameras
 from smsr.cameras.gauge import fix_gauge
 from smsr.cameras.gimbal import fit_gimbal
@@ -23,7 +27,7 @@ from smsr.cameras.paces import fit_paces
 from smsr.cameras.paper import published_cameras, thresholded_factor
 from smsr.cameras.relaxed import relaxed_cameras, relaxed_factor
 from smsr.cameras.rest import resting_frame
-from smsr.cameras.rigid import rigid_cameras
+from smsr.cameras.rigid import looks_rigid, rigid_cameras
 from smsr.cameras.selection import part_outside_span, with_simple_path, with_uniform_path
 from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
 from smsr.cameras.turn import refine_velocity, with_shake
@@ -300,7 +304,126 @@ class TestFree:
         assert angle_between(G, trembling) == pytest.approx(0.1 * np.sqrt(3.0), rel=0.2)
 
 
+def factored(W: Array) -> tuple[Array, Array]:
+    """Return left singular vectors and singular values of tracks, the largest 1."""
+    left, values, _ = np.linalg.svd(W - W.mean(axis=1, keepdims=True), full_matrices=False)
+    return left[:, :30], values[:30] / values[0]
+
+
+def board(rotations: Array, bend: float = 0.0, seed: int = 0) -> Array:
+    """Return the tracks (2T, N) of a board that bends to and fro."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1.0, 1.0, (2, 40)) * np.array([[1.0], [0.7]])
+    time = np.linspace(0.0, 1.0, len(rotations))[:, None]
+    shapes = np.zeros((len(rotations), 3, points.shape[1]))
+    shapes[:, :2] = points
+    shapes[:, 2] = bend * np.sin(13.0 * time) * np.cos(2.0 * points[0] + points[1])
+    shapes = np.linalg.qr(rng.standard_normal((3, 3)))[0] @ shapes
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    return np.asarray((rotations[:, :2] @ shapes).reshape(2 * len(rotations), -1))
+
+
+def tilted(frames: int = 80, degrees: float = 4.0) -> FlatViews:
+    """Return the views of a board that turns about an axis in it, seen twice from the front."""
+    rotations = orbit(frames, degrees) @ Rotation.from_euler("y", 60.0, degrees=True).as_matrix()
+    return FlatViews(rotations[:, :2, :2], rotations[:, :2, 2])
+
+
+class TestFlat:
+    @pytest.mark.parametrize("bend", [0.0, 0.05, 0.2])
+    def test_a_board_shows_its_cameras_however_it_bends(self, bend: float) -> None:
+        true = lissajous(np.arange(120.0), np.random.default_rng(0))
+        left, values = factored(board(true, bend))
+        views = flat_views(left, values)
+        assert views is not None
+        assert_cameras(views.rotations)
+        assert angle_between(views.rotations, true) < 0.001 + 0.6 * bend
+        # A rigid or relaxed upgrade takes the bending for depth.
+        assert angle_between(relaxed_cameras(left, values).rotations, true) > 0.4
+
+    @pytest.mark.parametrize("turn", [orbit(90, 3.0), swing(90)])
+    def test_whoever_turns_the_image_or_mirrors_it_gets_the_same(self, turn: Array) -> None:
+        W = board(turn, 0.1)
+        about = Rotation.from_euler("z", 0.7).as_matrix()[:2, :2] @ np.diag([1.0, -1.0])
+        other = (about @ W.reshape(len(turn), 2, -1)).reshape(W.shape)
+        one, two = (flat_views(*factored(tracks)) for tracks in (W, other))
+        assert one is not None
+        assert two is not None
+        np.testing.assert_allclose(
+            np.linalg.norm(one.tilts, axis=1), np.linalg.norm(two.tilts, axis=1), atol=1e-4
+        )
+
+    def test_what_is_not_seen_as_a_plane_is_refused(self) -> None:
+        lone = np.outer(np.cos(np.arange(80.0)), np.arange(9.0))
+        rng = np.random.default_rng(0)
+        anyhow = rng.standard_normal((80, 2)) @ rng.standard_normal((2, 9))
+        for W in (lone, anyhow, board(orbit(FEWEST_FRAMES - 1, 9.0))):
+            assert flat_views(*factored(W)) is None
+
+    def test_signs_are_those_of_the_smoothest_path(self) -> None:
+        rng = np.random.default_rng(0)
+        for frames in (2, 3, 4, 9):
+            vectors = rng.standard_normal((frames, 2))
+            costs = {
+                signs: float((np.diff(np.array(signs)[:, None] * vectors, 2, axis=0) ** 2).sum())
+                for signs in product((1.0, -1.0), repeat=frames)
+                if signs[0] == 1.0
+            }
+            found = tuple(smoothest_signs(vectors).tolist())
+            assert costs[found] == pytest.approx(min(costs.values()), abs=1e-12)
+
+    def test_reversals_are_taken_back_where_the_camera_keeps_turning(self) -> None:
+        views = tilted()
+        frontal = views.frontal_frames()
+        assert len(frontal) >= 2
+        spoilt = views.reversed_from(frontal[0]).reversed_from(frontal[1])
+        assert np.abs(spoilt.tilts - views.tilts).max() > 0.5
+        mended = steadier(spoilt)
+        assert angle_between(mended.rotations, views.rotations) == pytest.approx(0.0, abs=1e-6)
+
+    def test_what_swings_is_not_made_to_turn(self) -> None:
+        rotations = swing(60)
+        views = FlatViews(rotations[:, :2, :2], rotations[:, :2, 2])
+        np.testing.assert_array_equal(steadier(views).tilts, views.tilts)
+
+    def test_reversals_nearest_to_other_cameras(self) -> None:
+        views = tilted()
+        signs = np.random.default_rng(1).choice([1.0, -1.0], len(views.tilts))
+        signs[:12] = 1.0
+        anyhow = FlatViews(views.rows, signs[:, None] * views.tilts)
+        near = anyhow.nearest_to(views.rotations)
+        np.testing.assert_allclose(near.rotations, views.rotations, atol=1e-9)
+
+    @pytest.mark.parametrize("sheet", list(SHEETS))
+    def test_sheets_are_taken_for_flat(self, sheet: str) -> None:
+        W, true, _ = sheet_tracks(sheet, "fast", seed=0)
+        left, values = factored(W)
+        found = free_cameras(left, values)
+        assert (found.model, found.flat) == ("flat", True)
+        assert "the mean shape is flat" in found.reason
+        assert found.criteria["complexity"] < 0.8 * found.criteria["relaxed_complexity"]
+        relaxed = angle_between(relaxed_cameras(left, values).rotations, true)
+        assert angle_between(found.rotations, true) < 0.45 * relaxed
+
+    def test_other_shapes_are_not(self) -> None:
+        for seed in range(4):
+            found = free_cameras(*low_rank(swing(), modes=3, amplitude=0.4, seed=seed))
+            assert (found.model, found.flat) == ("relaxed", False)
+
+    def test_a_path_is_found_for_flat_cameras_too(self) -> None:
+        turn = orbit(120, 3.0)
+        left, values = factored(board(turn, 0.2))
+        found = with_simple_path(free_cameras(left, values), left * values)
+        assert (found.model, found.flat) == ("uniform", True)
+        assert camera_error(found.rotations, turn) < 0.02
+
+
 class TestRigid:
+    def test_a_flat_object_that_bends_has_three_directions_but_is_not_rigid(self) -> None:
+        left, values = factored(board(orbit(60, 5.0), 0.1))
+        assert looks_rigid(values)
+        assert rigid_cameras(left, values) is None
+
     def test_cameras_are_exact_however_little_the_object_turns(self) -> None:
         true = orbit(20, degrees=0.5)
         estimate = rigid_cameras(*low_rank(true, modes=0))

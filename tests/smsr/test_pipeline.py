@@ -13,6 +13,7 @@ import smsr
 from smsr import Progress, evaluate, reconstruct
 from smsr import rotations as so3
 from smsr.benchmark.camera_paths import errors
+from smsr.benchmark.sheets import sheet_tracks
 from smsr.cameras import estimate_cameras, fix_gauge
 from smsr.errors import Cancelled, InvalidOption, UnknownOption
 from smsr.options import Options, resolve
@@ -446,7 +447,6 @@ class TestDegenerateInput:
         ("name", "code"),
         [
             ("rigid", "rigid"),
-            ("flat", "near-planar"),
             ("still", "near-planar"),
             ("still", "little-rotation"),
             ("smallest still", "near-planar"),
@@ -455,6 +455,33 @@ class TestDegenerateInput:
     def test_user_is_cautioned(self, name: str, code: str) -> None:
         cautions = reconstruct(degenerate()[name]).diagnostics.cautions
         assert code in [caution.code for caution in cautions]
+
+    def test_a_sheet_is_seen_to_be_flat_and_warned_of_reversals(self) -> None:
+        W, cameras, shapes = sheet_tracks("paper", "lissajous", seed=0)
+        result = reconstruct(W)
+        assert result.diagnostics.camera_model == "flat"
+        assert_valid(result, W, tolerance=1e-8)
+        found = errors(result.cameras, result.shapes.transpose(0, 2, 1), cameras, shapes)
+        assert found.camera < 0.05
+        (caution,) = result.diagnostics.cautions
+        assert caution.code == "reversals"
+        assert result.diagnostics.camera_criteria["frontal_views"] == 1.0
+        assert "seen from the front once" in caution.message
+
+    def test_a_board_that_does_not_deform(self) -> None:
+        """Its depth is no guess: no caution says so."""
+        result = reconstruct(degenerate()["flat"])
+        assert result.diagnostics.camera_criteria["complexity"] < 0.02
+        assert "near-planar" not in {caution.code for caution in result.diagnostics.cautions}
+        thickness = np.linalg.svd(result.shapes[0] - result.shapes[0].mean(axis=0))[1]
+        assert thickness[2] < 0.02 * thickness[1]
+
+    def test_a_path_of_the_camera_leaves_no_reversals(self) -> None:
+        W, cameras, shapes = sheet_tracks("paper", "fast", seed=0)
+        result = reconstruct(W)
+        found = errors(result.cameras, result.shapes.transpose(0, 2, 1), cameras, shapes)
+        assert found.object < 0.05
+        assert (result.diagnostics.camera_model, result.diagnostics.cautions) == ("uniform", ())
 
     @pytest.mark.parametrize("seed", [0, 1, 2])
     def test_a_camera_held_in_the_hand_shows_depth(self, seed: int) -> None:
