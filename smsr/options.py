@@ -88,7 +88,8 @@ class Options:
         "How cameras are found: 'relaxed' by convex problems, 'uniform' as a turn of constant "
         "velocity, 'paper' by rank-3 thresholding. 'auto' is 'paper' in that preset; otherwise "
         "the relaxed cameras, less the drift that points at rest show, or a simple path of the "
-        "camera where that explains them; for a rigid object they come from its factorisation.",
+        "camera where that explains them; for a rigid object they come from its factorisation, for "
+        "one that is flat but for its deformation from how its plane is seen.",
     )
     camera_scale: Literal["constant", "varying"] = option(
         "constant",

@@ -19,7 +19,7 @@ from smsr.cameras.estimate import scaled_motion, usable_rank
 from smsr.cameras.flat import flat_views, steadier
 from smsr.cameras.relaxed import relaxed_cameras
 from smsr.progress import ignore, part_of
-from smsr.shapes import DepthProblem
+from smsr.shapes import DepthProblem, steadiness
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,6 +66,11 @@ those of the relaxations. Where the two nearly agree, the relaxed ones are more 
 must be apart, the more so where these are certain, whatever reversals there may be; or far apart by
 reversals and much simpler."""
 
+_SIMPLE = 0.5
+_STEADY, _UNSTEADY = 0.95, 0.6
+"""Complexity from which on the steadiness of the shapes counts as well: above the second with the
+cameras of a flat mean shape and below the third with relaxed ones, those are taken."""
+
 _FRONTAL = math.sin(math.radians(30.0))
 """Tilt of a plane below which the tracks hardly tell which side is up."""
 
@@ -81,6 +86,7 @@ def free_cameras(
     *,
     basis_size: int | None = None,
     noise: float = 0.0,
+    may_be_flat: bool = True,
     max_iterations: int = 500,
     tolerance: float = 1e-6,
     hook: StageHook = ignore,
@@ -99,6 +105,8 @@ def free_cameras(
         Noise that was taken off, as a part of the tracks' spread. The trace shortens the depth
         that cameras see and lets them drift, but steadies them where the tracks are uncertain: the
         less noise, the less weight of the trace in the first relaxation.
+    may_be_flat : bool
+        Look for a flat mean shape, too, unless K is known.
     max_iterations, tolerance, hook
         As for `smsr.cameras.relaxed.relaxed_cameras`.
 
@@ -163,7 +171,7 @@ def free_cameras(
         if doubtful and other.complexity <= _AS_GOOD * best.complexity
     ]
     disagreement = math.degrees(max(angles, default=0.0))
-    if basis_size is None and best.complexity > _NEARLY_RIGID:
+    if may_be_flat and basis_size is None and best.complexity > _NEARLY_RIGID:
         flat = _of_flat_shape(best, left, values)
         if flat is not None:
             return flat
@@ -190,12 +198,18 @@ def _of_flat_shape(
         return None
     measurements, before = left * values, relaxed.complexity
     now = complexity(measurements, views.rotations)
-    if now >= before or _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
+    if now >= before:
         return None
-    views = steadier(views)
-    now = complexity(measurements, views.rotations)
-    if now >= _CLEARLY_SIMPLER * before or (now >= _CREDIBLE_FLAT and before <= 1.0):
-        return None
+    taken = not _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before)
+    if taken:
+        views = steadier(views)
+        now = complexity(measurements, views.rotations)
+        taken = now < _CLEARLY_SIMPLER * before and (now < _CREDIBLE_FLAT or before > 1.0)
+    reason = f"give shapes that are {1.0 - now / before:.0%} simpler"
+    if not taken:
+        if before < _SIMPLE or not _is_steadier(measurements, views, relaxed):
+            return None
+        reason = "explain the shake of the tracks better"
     return dataclasses.replace(
         relaxed.estimate,
         rotations=views.rotations,
@@ -207,8 +221,8 @@ def _of_flat_shape(
             "relaxed_complexity": before,
             "frontal_views": float(len(views.frontal_frames(_FRONTAL))),
         },
-        reason="the mean shape is flat, and cameras that see it as a plane give shapes that are "
-        f"{1.0 - now / before:.0%} simpler than those of the best {relaxed.estimate.reason}",
+        reason=f"the mean shape is flat, and cameras that see it as a plane {reason} than those "
+        f"of the best {relaxed.estimate.reason}",
     )
 
 
@@ -219,6 +233,16 @@ def _is_the_same(views: FlatViews, relaxed: _Relaxation, *, far_simpler: bool) -
     if angle_between(cameras, views.nearest_to(cameras).rotations) >= limit:
         return False
     return not far_simpler or angle_between(cameras, views.rotations) < _FAR_APART
+
+
+def _is_steadier(measurements: NDArray[np.float64], views: FlatViews, relaxed: _Relaxation) -> bool:
+    """Tell whether views of a plane explain a shake that relaxed cameras do not."""
+
+    def steady(rotations: NDArray[np.float64]) -> float:
+        problem = _simplest_shapes(measurements, rotations)
+        return steadiness(problem.shapes.reshape(problem.frames, 3, -1), problem.rotations)
+
+    return steady(views.rotations) > _STEADY and steady(relaxed.estimate.rotations) < _UNSTEADY
 
 
 def _agree(first: _Relaxation, second: _Relaxation) -> bool:
@@ -250,12 +274,19 @@ def complexity(measurements: NDArray[np.float64], rotations: NDArray[np.float64]
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     """
+    return _simplest_shapes(measurements, rotations).complexity()
+
+
+def _simplest_shapes(
+    measurements: NDArray[np.float64], rotations: NDArray[np.float64]
+) -> DepthProblem:
+    """Return the problem of the best shapes, solved roughly on some frames and directions."""
     step = math.ceil(len(rotations) / _FRAMES)
     problem = DepthProblem(
         every_frame(measurements, step)[:, :_DIRECTIONS], np.ascontiguousarray(rotations[::step])
     )
     problem.minimise(60, 3e-4)
-    return problem.complexity()
+    return problem
 
 
 def every_frame(measurements: NDArray[np.float64], step: int) -> NDArray[np.float64]:

@@ -103,6 +103,7 @@ def estimate_cameras(
         values,
         basis_size=options.basis_size,
         noise=noise,
+        may_be_flat=options.camera_model != "relaxed",
         max_iterations=options.camera_iterations,
         tolerance=options.camera_tolerance,
         hook=part_of(hook, 0.0, 0.5),
