@@ -29,10 +29,17 @@ _STEADY_ENOUGH = 0.5
 _GROWING = 1.25
 _GROWING_IN_DOUBT = 1.5
 _LITTLE_ROTATION = math.radians(10.0)
+_SEEN_AROUND = math.radians(150.0)
+_KEEP_REVERSALS = ("flat", "axis", "gimbal")
 
 
 def input_cautions(
-    values: NDArray[np.float64], solved: VirtualPoints, points: int, *, flat: bool = False
+    values: NDArray[np.float64],
+    solved: VirtualPoints,
+    points: int,
+    *,
+    flat: bool = False,
+    rigid: bool = True,
 ) -> list[Caution]:
     """Judge the singular values of the measurements.
 
@@ -47,6 +54,8 @@ def input_cautions(
     flat : bool
         Whether the object was seen to be flat but for its deformation: then few directions are no
         reason to doubt its depth, or that it deforms.
+    rigid : bool
+        Whether the object may be rigid: no cameras that suppose so were refused.
     """
     found = []
     rows, kept = len(solved.left), len(solved.values)
@@ -60,7 +69,7 @@ def input_cautions(
                 "turns against the camera. Its depth is a guess.",
             )
         )
-    elif _part_beyond(values, 3) < RIGID_REST:
+    elif rigid and _part_beyond(values, 3) < RIGID_REST:
         found.append(
             Caution(
                 "rigid",
@@ -123,8 +132,18 @@ def camera_cautions(rotations: NDArray[np.float64], estimate: CameraEstimate) ->
                 "so depth is uncertain. Tracks over more frames or with more motion would help.",
             )
         )
+    if not estimate.criteria.get("width_is_determined", 1.0) and spread < _SEEN_AROUND:
+        found.append(
+            Caution(
+                "assumed-width",
+                "The object is flat but for its deformation, and the camera turns by "
+                f"{math.degrees(spread):.0f} degrees about much the same axis. The tracks hardly "
+                "tell how long it is across: it was taken to be seen from the front once. If it "
+                "was not, it is longer, and tilted more.",
+            )
+        )
     views = round(estimate.criteria.get("frontal_views", 0.0))
-    if estimate.model == "flat" and views > 0:
+    if estimate.model in _KEEP_REVERSALS and views > 0:
         found.append(
             Caution(
                 "reversals",

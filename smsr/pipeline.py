@@ -231,7 +231,13 @@ def _solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
         camera_criteria=estimate.criteria,
         noise=points.noise,
         cautions=(
-            *input_cautions(space.singular_values, points, space.points, flat=estimate.flat),
+            *input_cautions(
+                space.singular_values,
+                points,
+                space.points,
+                flat=estimate.flat,
+                rigid=options.camera_model != "auto" or estimate.model == "rigid",
+            ),
             *camera_cautions(rotations, estimate),
             *depth_cautions(found.complexity, found.steadiness),
             *size_cautions(_growth(found.shapes, reduction, space, options), found.complexity),

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.signal import find_peaks
 
 from smsr import rotations as so3
 from smsr.cameras.uniform import fit_uniform_turn
@@ -36,15 +37,16 @@ _MISFIT = 0.08
 keeps its size change little, even where it bends."""
 
 _FRAMES = 400
-_LARGE = 0.003  # weight of a plane seen from the front: without it one could always be smaller
+_LONGEST = 0.003  # weight of a plane seen from the front: without it one could always be smaller
 _OUTLIER = 0.05
-_START = 0.8  # a plane that turns evenly is seen at .7 of its width on average
-_FRONTAL = 0.8  # length of a tilt, below which reversals are tried
-_AROUND = 3  # frames
+_USUAL_WIDTH = 0.8  # of a plane that turns evenly, as it is seen
+_DETERMINED = 0.2  # change of the lengths by that of the plane, relative
+_NEARLY_FRONTAL = 0.8  # length of a tilt, below which reversals are tried
+_PASSAGE = 0.05  # by which tilts are longer before and after one
 _REVERSALS = 12
 _STEADY_FRAMES = 200
-_STEADY = 0.1
-_STEADIER = 0.5
+_STEADY = 0.1  # part of the rotation variance that a uniform turn may leave,
+_STEADIER = 0.5  # also as a part of what it left before
 _ROUNDS = 30
 
 
@@ -58,10 +60,14 @@ class FlatViews:
         P, the first two columns of the cameras.
     tilts : ndarray of shape (T, 2)
         The third column, where the reversal of each frame is chosen.
+    determined : bool
+        Whether they tell how long the plane is in every direction. Otherwise it was taken to be
+        seen from the front once.
     """
 
     rows: NDArray[np.float64]
     tilts: NDArray[np.float64]
+    determined: bool = True
 
     @property
     def rotations(self) -> NDArray[np.float64]:
@@ -71,15 +77,15 @@ class FlatViews:
 
     def every(self, step: int) -> FlatViews:
         """Return the views in every n-th frame."""
-        return FlatViews(self.rows[::step], self.tilts[::step])
+        return dataclasses.replace(self, rows=self.rows[::step], tilts=self.tilts[::step])
 
     def reversed_from(self, frame: int) -> FlatViews:
         """Return the views with the other side up from a frame on."""
         signs = np.where(np.arange(len(self.tilts)) < frame, 1.0, -1.0)
         return dataclasses.replace(self, tilts=self.tilts * signs[:, None])
 
-    def frontal_frames(self, limit: float = _FRONTAL) -> list[int]:
-        """Return the frames in which the plane is seen most from the front, those most so first.
+    def frontal_frames(self, limit: float = _NEARLY_FRONTAL) -> list[int]:
+        """Return the frames in which the plane passes the front, the nearest to it first.
 
         A reversal there changes least how the plane turns.
 
@@ -89,13 +95,8 @@ class FlatViews:
             Sine of the angle from the front that is too much.
         """
         lengths = np.linalg.norm(self.tilts, axis=1)
-        lowest = [
-            t
-            for t in range(1, len(lengths))
-            if lengths[t] < limit
-            and lengths[t] <= lengths[max(0, t - _AROUND) : t + _AROUND + 1].min()
-        ]
-        return sorted(lowest, key=lambda t: float(lengths[t]))
+        lowest, _ = find_peaks(-lengths, height=-limit, prominence=_PASSAGE)
+        return sorted(lowest.tolist(), key=lambda t: float(lengths[t]))
 
     def nearest_to(self, rotations: NDArray[np.float64]) -> FlatViews:
         """Return the views with the reversals that bring them nearest to some cameras (T, 3, 3)."""
@@ -129,34 +130,38 @@ def flat_views(left: NDArray[np.float64], values: NDArray[np.float64]) -> FlatVi
     if len(values) < 2 or values[1] <= 1e-6 * values[0] or len(left) < 2 * FEWEST_FRAMES:
         return None
     images = (left[:, :2] * values[:2]).reshape(-1, 2, 2)
-    seen = images @ _to_true_size(images)
-    left, strengths, right = np.linalg.svd(seen)
-    if ((strengths[:, 0] - 1.0) ** 2).mean() > _MISFIT**2:
+    to_true_size, determined = _to_true_size(images)
+    axes, lengths, right = np.linalg.svd(images @ to_true_size)
+    if ((lengths[:, 0] - 1.0) ** 2).mean() > _MISFIT**2:
         return None
-    cosines = np.minimum(strengths[:, 1] / np.maximum(strengths[:, 0], np.finfo(float).tiny), 1.0)
-    rows = left @ (np.stack([np.ones_like(cosines), cosines], axis=1)[:, :, None] * right)
-    tilts = left[:, :, 1] * np.sqrt(1.0 - cosines**2)[:, None]
-    return FlatViews(rows, smoothest_signs(tilts)[:, None] * tilts)
+    cosines = np.minimum(lengths[:, 1] / np.maximum(lengths[:, 0], np.finfo(float).tiny), 1.0)
+    rows = axes @ (np.stack([np.ones_like(cosines), cosines], axis=1)[:, :, None] * right)
+    tilts = axes[:, :, 1] * np.sqrt(1.0 - cosines**2)[:, None]
+    return FlatViews(rows, smoothest_signs(tilts)[:, None] * tilts, determined)
 
 
-def _to_true_size(images: NDArray[np.float64]) -> NDArray[np.float64]:
+def _to_true_size(images: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
     """Return the matrix (2, 2) that makes of images (T, 2, 2) of a plane views of unit scale.
 
     Cameras that turn about an axis in the plane leave open how long it is across: the longest that
-    is never seen longer than that is taken, as if it had once been seen from the front.
+    is never seen longer than that is taken, as if it had once been seen from the front. Whether
+    that was not needed is returned as well.
     """
     some = images[:: math.ceil(len(images) / _FRAMES)]
-    width, height = _START / np.sqrt((some**2).mean(axis=(0, 1)) * 2.0)
+    seen = np.sqrt((some**2).mean(axis=(0, 1)) * 2.0)
+    width, height = _USUAL_WIDTH / np.maximum(seen, np.finfo(float).tiny)
 
     def matrix(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([[x[0] * width, 0.0], [x[1] * height, x[2] * height]])
 
     def excess(x: NDArray[np.float64]) -> NDArray[np.float64]:
         largest, smallest = _singular_values(some @ matrix(x))
-        return np.concatenate([largest - 1.0, math.sqrt(_LARGE) * (1.0 - smallest)])
+        return np.concatenate([largest - 1.0, math.sqrt(_LONGEST) * (1.0 - smallest)])
 
     found = least_squares(excess, [1.0, 0.0, 1.0], loss="soft_l1", f_scale=_OUTLIER, max_nfev=50)
-    return matrix(found.x)
+    by_size = np.asarray(found.jac)[: len(some)]
+    changes = np.linalg.svd(by_size, compute_uv=False) / math.sqrt(len(some))
+    return matrix(found.x), bool(changes[-1] > _DETERMINED)
 
 
 def _singular_values(

@@ -18,6 +18,7 @@ from smsr.cameras.constraints import orthonormality_form
 from smsr.cameras.estimate import scaled_motion, usable_rank
 from smsr.cameras.flat import flat_views, steadier
 from smsr.cameras.relaxed import relaxed_cameras
+from smsr.cameras.rigid import part_left
 from smsr.progress import ignore, part_of
 from smsr.shapes import DepthProblem, steadiness
 
@@ -60,18 +61,20 @@ _NEARLY_RIGID = 0.15
 
 _CLEARLY_SIMPLER, _FAR_SIMPLER = 0.8, 0.6
 _CREDIBLE_FLAT = 0.5
-_APART, _APART_IF_CERTAIN, _FAR_APART = np.radians([15.0, 20.0, 25.0]).tolist()
+_APART, _APART_IF_CERTAIN, _FAR_APART = np.radians([15.0, 20.0, 20.0]).tolist()
 """Cameras of a flat mean shape are taken where their shapes are simple, and clearly simpler than
 those of the relaxations. Where the two nearly agree, the relaxed ones are more accurate. So they
 must be apart, the more so where these are certain, whatever reversals there may be; or far apart by
 reversals and much simpler."""
 
 _SIMPLE = 0.5
-_STEADY, _UNSTEADY = 0.95, 0.6
-"""Complexity from which on the steadiness of the shapes counts as well: above the second with the
-cameras of a flat mean shape and below the third with relaxed ones, those are taken."""
+_HARDLY_DEFORMING = 0.03
+_STEADY_SHAPES, _UNSTEADY_SHAPES = 0.95, 0.5
+"""Complexity from which on, where three directions leave at least the second of the tracks, the
+steadiness of the shapes counts as well: above the third with the cameras of a flat mean shape and
+below the fourth with relaxed ones, those are taken."""
 
-_FRONTAL = math.sin(math.radians(30.0))
+_FROM_THE_FRONT = math.sin(math.radians(30.0))
 """Tilt of a plane below which the tracks hardly tell which side is up."""
 
 _AGREEMENT = math.radians(6.0)
@@ -116,8 +119,9 @@ def free_cameras(
         Its criteria are ``complexity``, see there, and ``disagreement``, the largest root mean
         square angle in degrees to the cameras of a relaxation that is nearly as good, 0 where the
         shapes are so simple that the cameras are certain. Of a flat mean shape they are
-        ``relaxed_complexity``, that of the best relaxation, and ``frontal_views``, how often the
-        object is seen from the front, instead of the second.
+        ``relaxed_complexity``, that of the best relaxation, ``width_is_determined``, 0 where it is
+        as if the object had been seen from the front once, and ``frontal_views``, how often it
+        is, instead of the second.
     """
     most = max(1, len(values) // 3)
     share = min(noise / _NOISY, 1.0) ** 2
@@ -207,7 +211,8 @@ def _of_flat_shape(
         taken = now < _CLEARLY_SIMPLER * before and (now < _CREDIBLE_FLAT or before > 1.0)
     reason = f"give shapes that are {1.0 - now / before:.0%} simpler"
     if not taken:
-        if before < _SIMPLE or not _is_steadier(measurements, views, relaxed):
+        unclear = before >= _SIMPLE and part_left(values) > _HARDLY_DEFORMING
+        if not unclear or not _is_steadier(measurements, views, relaxed):
             return None
         reason = "explain the shake of the tracks better"
     return dataclasses.replace(
@@ -219,7 +224,8 @@ def _of_flat_shape(
         criteria={
             "complexity": now,
             "relaxed_complexity": before,
-            "frontal_views": float(len(views.frontal_frames(_FRONTAL))),
+            "width_is_determined": float(views.determined),
+            "frontal_views": float(len(views.frontal_frames(_FROM_THE_FRONT))),
         },
         reason=f"the mean shape is flat, and cameras that see it as a plane {reason} than those "
         f"of the best {relaxed.estimate.reason}",
@@ -242,7 +248,10 @@ def _is_steadier(measurements: NDArray[np.float64], views: FlatViews, relaxed: _
         problem = _simplest_shapes(measurements, rotations)
         return steadiness(problem.shapes.reshape(problem.frames, 3, -1), problem.rotations)
 
-    return steady(views.rotations) > _STEADY and steady(relaxed.estimate.rotations) < _UNSTEADY
+    return (
+        steady(views.rotations) > _STEADY_SHAPES
+        and steady(relaxed.estimate.rotations) < _UNSTEADY_SHAPES
+    )
 
 
 def _agree(first: _Relaxation, second: _Relaxation) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,9 +18,11 @@ RIGID_REST = 0.002
 noise may have left the rest. More is deformation, however little, and seen well by the cameras and
 shapes of deforming objects."""
 
-_MISFIT = 0.1
-"""Root mean square of what the constraints of orthonormal rows may miss by. A flat object that
-deforms has three directions as well, but they are not those of a rigid one."""
+_MISFIT, _MISFIT_BY_REST = 0.01, 3.0
+"""Root mean square of what the constraints of orthonormal rows may miss by, also as a multiple of
+noise or of what three directions leave: noise misses by less than once as much. A flat object that
+deforms has three directions as well, but they are not those of a rigid one; nor are those of a
+rigid one that comes nearer."""
 
 _MOST_REST = 0.02  # that noise may have left
 _ABOVE_NOISE = 1.2
@@ -36,10 +39,17 @@ def looks_rigid(values: NDArray[np.float64], neglected: float = 0.0) -> bool:
         Standard deviation of noise that was left in, as a part of the tracks' spread.
     """
     limit = min(max(RIGID_REST, _ABOVE_NOISE * neglected), _MOST_REST)
-    return bool(np.linalg.norm(values[3:]) < limit * np.linalg.norm(values))
+    return part_left(values) < limit
 
 
-def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> CameraEstimate | None:
+def part_left(values: NDArray[np.float64]) -> float:
+    """Return which part of the tracks three directions leave."""
+    return float(np.linalg.norm(values[3:]) / np.linalg.norm(values))
+
+
+def rigid_cameras(
+    left: NDArray[np.float64], values: NDArray[np.float64], noise: float = 0.0
+) -> CameraEstimate | None:
     """Find the cameras of a rigid object by linear least squares (Tomasi and Kanade).
 
     Unlike the relaxed problem it has no weight on the trace, which shortens the depth of an object
@@ -51,6 +61,8 @@ def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> Cam
         Left singular vectors of the centred measurements, rows u1, v1, u2, ...
     values : ndarray of shape (r,)
         Singular values, largest first.
+    noise : float
+        Standard deviation of the noise that was taken off, as a part of the tracks' spread.
 
     Returns
     -------
@@ -69,7 +81,8 @@ def rigid_cameras(left: NDArray[np.float64], values: NDArray[np.float64]) -> Cam
     strengths = np.linalg.eigvalsh(F)
     if rank < 6 or strengths[0] <= 1e-6 * strengths[-1]:
         return None
-    if ((constraints @ solution - lengths) ** 2).sum() > _MISFIT**2 * len(uu):
+    misfit = math.sqrt(((constraints @ solution - lengths) ** 2).sum() / len(uu))
+    if misfit > max(_MISFIT, _MISFIT_BY_REST * max(part_left(values), noise)):
         return None
     return CameraEstimate(
         rotations=cameras_from_factor(motion, F),

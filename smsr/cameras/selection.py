@@ -95,7 +95,7 @@ def estimate_cameras(
             hook=hook,
         )
     if options.camera_model == "auto" and looks_rigid(values, neglected):
-        rigid = rigid_cameras(left, values)
+        rigid = rigid_cameras(left, values, noise)
         if rigid is not None:
             return rigid
     free = free_cameras(

@@ -323,6 +323,13 @@ def board(rotations: Array, bend: float = 0.0, seed: int = 0) -> Array:
     return np.asarray((rotations[:, :2] @ shapes).reshape(2 * len(rotations), -1))
 
 
+def rocking(least: float, most: float, frames: int = 100) -> Array:
+    """Return rotations (T, 3, 3) to and fro between two angles, in degrees, about one axis."""
+    middle, swing = (most + least) / 2.0, (most - least) / 2.0
+    angles = middle + swing * np.sin(np.linspace(0.0, 9.0, frames))
+    return so3.exp(np.radians(angles)[:, None] * np.array([0.0, 1.0, 0.0]))
+
+
 def tilted(frames: int = 80, degrees: float = 4.0) -> FlatViews:
     """Return the views of a board that turns about an axis in it, seen twice from the front."""
     rotations = orbit(frames, degrees) @ Rotation.from_euler("y", 60.0, degrees=True).as_matrix()
@@ -381,6 +388,28 @@ class TestFlat:
         mended = steadier(spoilt)
         assert angle_between(mended.rotations, views.rotations) == pytest.approx(0.0, abs=1e-6)
 
+    def test_a_view_from_the_front_counts_once_however_long_it_lasts(self) -> None:
+        views = tilted()
+        (first, *_) = frontal = sorted(views.frontal_frames())
+        times = np.ones(len(views.tilts), dtype=int)
+        times[first] = 20
+        held = FlatViews(views.rows.repeat(times, axis=0), views.tilts.repeat(times, axis=0))
+        assert len(held.frontal_frames()) == len(frontal)
+        spoilt = held.reversed_from(sorted(held.frontal_frames())[0])
+        assert angle_between(spoilt.rotations, held.rotations) > 0.5
+        shaken = views.tilts + 0.01 * np.random.default_rng(0).standard_normal(views.tilts.shape)
+        assert len(FlatViews(views.rows, shaken).frontal_frames(0.5)) == len(frontal)
+
+    def test_whether_the_width_is_told(self) -> None:
+        """About one axis in the plane, any board is as good as one seen from the front once."""
+        for turn, told in ((rocking(38.0, 66.0), False), (swing(100), True)):
+            flat_in_image = np.concatenate([np.eye(3)[:2], np.zeros((1, 3))])
+            points = flat_in_image @ np.random.default_rng(0).uniform(-1.0, 1.0, (3, 40))
+            points -= points.mean(axis=1, keepdims=True)
+            views = flat_views(*factored((turn[:, :2] @ points).reshape(2 * len(turn), -1)))
+            assert views is not None
+            assert views.determined is told
+
     def test_what_swings_is_not_made_to_turn(self) -> None:
         rotations = swing(60)
         views = FlatViews(rotations[:, :2, :2], rotations[:, :2, 2])
@@ -437,6 +466,16 @@ class TestRigid:
         left, values = factored(board(orbit(60, 5.0), 0.1))
         assert looks_rigid(values)
         assert rigid_cameras(left, values) is None
+
+    @pytest.mark.parametrize("noise", [1e-3, 5e-3])
+    def test_noise_does_not_make_a_rigid_object_another(self, noise: float) -> None:
+        rng = np.random.default_rng(0)
+        shape = rng.standard_normal((3, 50))
+        turn = orbit(60, 0.3)
+        W = (turn[:, :2] @ shape).reshape(120, 50) + noise * rng.standard_normal((120, 50))
+        found = rigid_cameras(*factored(W))
+        assert found is not None
+        assert camera_error(found.rotations, turn) < 40.0 * noise
 
     def test_cameras_are_exact_however_little_the_object_turns(self) -> None:
         true = orbit(20, degrees=0.5)

@@ -469,12 +469,26 @@ class TestDegenerateInput:
         assert "seen from the front once" in caution.message
 
     def test_a_board_that_does_not_deform(self) -> None:
-        """Its depth is no guess: no caution says so."""
+        """Seen from the front once, its depth is no guess, and no caution says so."""
         result = reconstruct(degenerate()["flat"])
         assert result.diagnostics.camera_criteria["complexity"] < 0.02
         assert "near-planar" not in {caution.code for caution in result.diagnostics.cautions}
         thickness = np.linalg.svd(result.shapes[0] - result.shapes[0].mean(axis=0))[1]
         assert thickness[2] < 0.02 * thickness[1]
+
+    def test_who_asks_for_relaxed_cameras_gets_them(self) -> None:
+        W, _, _ = sheet_tracks("paper", "lissajous", seed=0)
+        result = reconstruct(W, camera_model="relaxed")
+        assert result.diagnostics.camera_model == "relaxed"
+        assert "relaxed_complexity" not in result.diagnostics.camera_criteria
+
+    def test_a_guess_of_the_width_is_told(self) -> None:
+        """A board that rocks about one axis and is never seen from the front."""
+        angles = np.radians(52.0 + 14.0 * np.sin(np.linspace(0.0, 9.0, 100)))
+        points = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 40)) * [[1.0], [0.7], [0.0]]
+        turn = so3.exp(angles[:, None] * np.array([0.0, 1.0, 0.0]))
+        result = reconstruct((turn[:, :2] @ points).reshape(200, 40))
+        assert "assumed-width" in {caution.code for caution in result.diagnostics.cautions}
 
     def test_a_path_of_the_camera_leaves_no_reversals(self) -> None:
         W, cameras, shapes = sheet_tracks("paper", "fast", seed=0)
