@@ -9,9 +9,7 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
-from dataclasses import asdict
 from pathlib import Path
 
 from smsr.benchmark.camera_paths import (
@@ -22,6 +20,7 @@ from smsr.benchmark.camera_paths import (
     lost_lines,
     measure_members,
     rows,
+    write_members,
 )
 
 
@@ -48,8 +47,7 @@ def main() -> None:
     members = list(measure_members(chosen.data, which, chosen.processes))
     text = markdown(rows(members), lost_lines(members))
     chosen.out.with_suffix(".md").write_text(text)
-    report = [asdict(one) for one in members]
-    chosen.out.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+    write_members(chosen.out.with_suffix(".json"), members)
     print(text)
 
 

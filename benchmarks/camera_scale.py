@@ -12,9 +12,8 @@ e3d over the shapes, in the object frame and, behind the slash, in the camera fr
 from __future__ import annotations
 
 import argparse
-import json
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +27,7 @@ from smsr.benchmark.camera_paths import (
     keys,
     of_each_member,
     tracks,
+    write_members,
 )
 from smsr.metrics import evaluate
 from smsr.pipeline import reconstruct
@@ -134,8 +134,7 @@ def main() -> None:
     members = list(of_each_member(partial(measure, chosen.data), which, chosen.processes))
     print(table(members))
     if chosen.json:
-        report = [asdict(one) for one in members]
-        chosen.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_members(chosen.json, members)
 
 
 if __name__ == "__main__":

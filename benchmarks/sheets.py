@@ -10,16 +10,22 @@ the default shape stage with the true cameras.
 from __future__ import annotations
 
 import argparse
-import json
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from smsr.benchmark.camera_paths import PATHS, compared, geometric_mean, of_each_member
+from smsr.benchmark.camera_paths import (
+    PATHS,
+    compared,
+    geometric_mean,
+    of_each_member,
+    write_members,
+)
 from smsr.benchmark.sheets import SHEETS, sheet_tracks
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from smsr.benchmark.camera_paths import Errors, Member
 
 SOME_PATHS = (
@@ -48,13 +54,13 @@ def table(members: list[Member]) -> str:
     ]
     for noise, sheet in dict.fromkeys((one.noise, one.shape) for one in members):
         some = [one for one in members if (one.noise, one.shape) == (noise, sheet)]
-        cells = [_cell([one.baseline for one in some])]
-        cells += [_cell([one.default for one in some]), _cell([one.true_cameras for one in some])]
+        ways = zip(*((one.baseline, one.default, one.true_cameras) for one in some), strict=True)
+        cells = [_cell(way) for way in ways]
         lines.append("| " + " | ".join([f"{noise:.0%}", sheet, *cells]) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _cell(some: list[Errors]) -> str:
+def _cell(some: Sequence[Errors]) -> str:
     in_object = geometric_mean(one.object for one in some)
     return f"{in_object:.3f} / {geometric_mean(one.camera for one in some):.3f}"
 
@@ -77,8 +83,7 @@ def main() -> None:
     members = list(of_each_member(measure, which, chosen.processes))
     print(table(members))
     if chosen.json:
-        report = [asdict(one) for one in members]
-        chosen.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_members(chosen.json, members)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smsr.cameras.rigid import RIGID_REST
+from smsr.cameras.rigid import RIGID_REST, part_beyond
+from smsr.cameras.trial import LOOSE
 from smsr.result import Caution
 from smsr.rotations import spread_of_views
 
@@ -30,7 +31,7 @@ _GROWING = 1.25
 _GROWING_IN_DOUBT = 1.5
 _LITTLE_ROTATION = math.radians(10.0)
 _SEEN_AROUND = math.radians(150.0)
-_KEEP_REVERSALS = ("flat", "axis", "gimbal")
+_KEEP_REVERSALS = LOOSE | {"flat"}
 
 
 def input_cautions(
@@ -53,15 +54,13 @@ def input_cautions(
         N.
     flat : bool
         Whether the object was seen to be flat but for its deformation: then few directions are no
-        reason to doubt its depth, or that it deforms.
+        reason to doubt its depth.
     rigid : bool
-        Whether the object may be rigid: no cameras that suppose so were refused.
+        Whether the object may be rigid: no cameras that suppose so were refused, nor is it flat.
     """
     found = []
     rows, kept = len(solved.left), len(solved.values)
-    if flat:
-        pass
-    elif _part_beyond(values, 2) < _FLAT:
+    if part_beyond(values, 2) < _FLAT and not flat:
         found.append(
             Caution(
                 "near-planar",
@@ -69,7 +68,7 @@ def input_cautions(
                 "turns against the camera. Its depth is a guess.",
             )
         )
-    elif rigid and _part_beyond(values, 3) < RIGID_REST:
+    elif rigid and part_beyond(values, 3) < RIGID_REST:
         found.append(
             Caution(
                 "rigid",
@@ -87,11 +86,11 @@ def input_cautions(
                 "give its standard deviation as the option noise.",
             )
         )
-    elif solved.noise == 0.0 and _part_beyond(values, kept) > _LOST:
+    elif solved.noise == 0.0 and part_beyond(values, kept) > _LOST:
         found.append(
             Caution(
                 "truncated",
-                f"{_part_beyond(values, kept):.1%} of the tracks lie outside the {kept} virtual "
+                f"{part_beyond(values, kept):.1%} of the tracks lie outside the {kept} virtual "
                 "points that were solved for and have zero depth. Raise virtual_points.",
             )
         )
@@ -220,8 +219,3 @@ def convergence_cautions(stages: Iterable[StageReport]) -> list[Caution]:
         for stage in stages
         if not stage.converged
     ]
-
-
-def _part_beyond(values: NDArray[np.float64], count: int) -> float:
-    """Return the part of the norm of the measurements beyond the first singular directions."""
-    return float(np.linalg.norm(values[count:]) / np.linalg.norm(values))

@@ -236,7 +236,8 @@ def _solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
                 points,
                 space.points,
                 flat=estimate.flat,
-                rigid=options.camera_model != "auto" or estimate.model == "rigid",
+                rigid=estimate.model == "rigid"
+                or not (estimate.flat or options.camera_model == "auto"),
             ),
             *camera_cautions(rotations, estimate),
             *depth_cautions(found.complexity, found.steadiness),

@@ -107,6 +107,13 @@ def camera_scales(cameras: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(scales, np.finfo(float).tiny)
 
 
+def part_of_rotation(mean_square: float, rotations: NDArray[np.float64]) -> float:
+    """Return which part of the variance of rotations (T, 3, 3) a mean squared angle makes up."""
+    spread = ((rotations - rotations.mean(axis=0)) ** 2).sum(axis=(1, 2)).mean()
+    # ||G - H||_F^2 is twice the squared angle between G and H, to second order.
+    return 2.0 * mean_square / max(float(spread), np.finfo(float).tiny)
+
+
 def spread_of_views(rotations: NDArray[np.float64]) -> float:
     """Return about the widest angle, in radians, between viewing directions of (T, 3, 3)."""
     axes = rotations[:, 2]

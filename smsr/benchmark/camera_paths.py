@@ -7,11 +7,12 @@ norm, with the default options, and with the true cameras.
 
 from __future__ import annotations
 
+import json
 import math
 import time
 import zlib
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from itertools import product
 from multiprocessing import get_context
@@ -348,6 +349,12 @@ def of_each_member(measure: Callable[[K], T], members: Sequence[K], processes: i
     context = get_context("spawn")  # threads of the caller's may hold locks
     with ProcessPoolExecutor(processes, context, _one_thread) as pool:
         yield from pool.map(measure, members)
+
+
+def write_members(path: Path, members: Iterable[Any]) -> None:
+    """Write members, dataclasses of any kind, as JSON."""
+    text = json.dumps([asdict(one) for one in members], indent=1)
+    path.write_text(text + "\n", encoding="utf-8")
 
 
 def _one_thread() -> None:

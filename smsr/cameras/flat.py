@@ -24,6 +24,7 @@ from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
 from smsr import rotations as so3
+from smsr.alignment import orthogonal_factor
 from smsr.cameras.uniform import fit_uniform_turn
 
 if TYPE_CHECKING:
@@ -70,10 +71,14 @@ class FlatViews:
     determined: bool = True
 
     @property
+    def cameras(self) -> NDArray[np.float64]:
+        """R (T, 2, 3), of orthonormal rows."""
+        return np.concatenate([self.rows, self.tilts[:, :, None]], axis=2)
+
+    @property
     def rotations(self) -> NDArray[np.float64]:
         """Cameras (T, 3, 3) completed by the viewing direction."""
-        cameras = np.concatenate([self.rows, self.tilts[:, :, None]], axis=2)
-        return so3.complete(so3.nearest_cameras(cameras))
+        return so3.complete(self.cameras)
 
     def every(self, step: int) -> FlatViews:
         """Return the views in every n-th frame."""
@@ -102,9 +107,8 @@ class FlatViews:
         """Return the views with the reversals that bring them nearest to some cameras (T, 3, 3)."""
         views = self
         for _ in range(_ROUNDS):
-            columns = np.concatenate([views.rows, views.tilts[:, :, None]], axis=2)
-            left, _, right = np.linalg.svd(np.einsum("tij,tik->jk", rotations[:, :2], columns))
-            wanted = (rotations[:, :2] @ (left @ right))[:, :, 2]
+            moments = np.einsum("tij,tik->jk", rotations[:, :2], views.cameras)
+            wanted = (rotations[:, :2] @ orthogonal_factor(moments))[:, :, 2]
             signs = np.where((wanted * views.tilts).sum(axis=1) < 0.0, -1.0, 1.0)
             if (signs > 0.0).all():
                 break
@@ -218,5 +222,4 @@ def _unsteadiness(views: FlatViews) -> float:
     """Return which part of the rotation variance a uniform turn leaves."""
     rotations = views.rotations
     angles = so3.angles_between(fit_uniform_turn(rotations).rotations, rotations)
-    spread = ((rotations - rotations.mean(axis=0)) ** 2).sum(axis=(1, 2)).mean()
-    return 2.0 * float((angles**2).mean()) / max(float(spread), np.finfo(float).tiny)
+    return so3.part_of_rotation(float((angles**2).mean()), rotations)

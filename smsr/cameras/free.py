@@ -18,7 +18,7 @@ from smsr.cameras.constraints import orthonormality_form
 from smsr.cameras.estimate import scaled_motion, usable_rank
 from smsr.cameras.flat import flat_views, steadier
 from smsr.cameras.relaxed import relaxed_cameras
-from smsr.cameras.rigid import part_left
+from smsr.cameras.rigid import part_beyond
 from smsr.progress import ignore, part_of
 from smsr.shapes import DepthProblem, steadiness
 
@@ -201,20 +201,28 @@ def _of_flat_shape(
     if views is None:
         return None
     measurements, before = left * values, relaxed.complexity
-    now = complexity(measurements, views.rotations)
+    problem = _simplest_shapes(measurements, views.rotations)
+    now = problem.complexity()
     if now >= before:
         return None
-    taken = not _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before)
-    if taken:
+    simpler = False
+    if not _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
         views = steadier(views)
-        now = complexity(measurements, views.rotations)
-        taken = now < _CLEARLY_SIMPLER * before and (now < _CREDIBLE_FLAT or before > 1.0)
-    reason = f"give shapes that are {1.0 - now / before:.0%} simpler"
-    if not taken:
-        unclear = before >= _SIMPLE and part_left(values) > _HARDLY_DEFORMING
-        if not unclear or not _is_steadier(measurements, views, relaxed):
-            return None
+        problem = _simplest_shapes(measurements, views.rotations)
+        now = problem.complexity()
+        simpler = now < _CLEARLY_SIMPLER * before and (now < _CREDIBLE_FLAT or before > 1.0)
+    if simpler:
+        reason = f"give shapes that are {1.0 - now / before:.0%} simpler"
+    elif (
+        before >= _SIMPLE
+        and part_beyond(values) > _HARDLY_DEFORMING
+        and _steadiness(problem) > _STEADY_SHAPES
+        and _steadiness(_simplest_shapes(measurements, relaxed.estimate.rotations))
+        < _UNSTEADY_SHAPES
+    ):
         reason = "explain the shake of the tracks better"
+    else:
+        return None
     return dataclasses.replace(
         relaxed.estimate,
         rotations=views.rotations,
@@ -241,17 +249,9 @@ def _is_the_same(views: FlatViews, relaxed: _Relaxation, *, far_simpler: bool) -
     return not far_simpler or angle_between(cameras, views.rotations) < _FAR_APART
 
 
-def _is_steadier(measurements: NDArray[np.float64], views: FlatViews, relaxed: _Relaxation) -> bool:
-    """Tell whether views of a plane explain a shake that relaxed cameras do not."""
-
-    def steady(rotations: NDArray[np.float64]) -> float:
-        problem = _simplest_shapes(measurements, rotations)
-        return steadiness(problem.shapes.reshape(problem.frames, 3, -1), problem.rotations)
-
-    return (
-        steady(views.rotations) > _STEADY_SHAPES
-        and steady(relaxed.estimate.rotations) < _UNSTEADY_SHAPES
-    )
+def _steadiness(problem: DepthProblem) -> float:
+    """Return what the steadiness of the best shapes says for their cameras."""
+    return steadiness(problem.shapes.reshape(problem.frames, 3, -1), problem.rotations)
 
 
 def _agree(first: _Relaxation, second: _Relaxation) -> bool:

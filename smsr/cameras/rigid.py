@@ -39,12 +39,12 @@ def looks_rigid(values: NDArray[np.float64], neglected: float = 0.0) -> bool:
         Standard deviation of noise that was left in, as a part of the tracks' spread.
     """
     limit = min(max(RIGID_REST, _ABOVE_NOISE * neglected), _MOST_REST)
-    return part_left(values) < limit
+    return part_beyond(values) < limit
 
 
-def part_left(values: NDArray[np.float64]) -> float:
-    """Return which part of the tracks three directions leave."""
-    return float(np.linalg.norm(values[3:]) / np.linalg.norm(values))
+def part_beyond(values: NDArray[np.float64], count: int = 3) -> float:
+    """Return which part of the norm of the tracks their first singular directions leave."""
+    return float(np.linalg.norm(values[count:]) / np.linalg.norm(values))
 
 
 def rigid_cameras(
@@ -82,7 +82,7 @@ def rigid_cameras(
     if rank < 6 or strengths[0] <= 1e-6 * strengths[-1]:
         return None
     misfit = math.sqrt(((constraints @ solution - lengths) ** 2).sum() / len(uu))
-    if misfit > max(_MISFIT, _MISFIT_BY_REST * max(part_left(values), noise)):
+    if misfit > max(_MISFIT, _MISFIT_BY_REST * max(part_beyond(values), noise)):
         return None
     return CameraEstimate(
         rotations=cameras_from_factor(motion, F),

@@ -46,6 +46,9 @@ they drift more, and let it move less."""
 NODDING_LIMITS = (0.02, 0.16)
 """The same two limits for a path with a nod, which fits much that it should not."""
 
+LOOSE = frozenset({"gimbal", "axis"})
+"""Models of paths that only correct the frame of the free cameras."""
+
 _FREE_ANGLES = 6  # as many parameters as a turn counts that goes on in any way about one axis
 _MOTION_WEIGHT = 1.5
 _REST_SMOOTHING = 4.0  # frames
@@ -95,7 +98,7 @@ class Path:
     @property
     def is_loose(self) -> bool:
         """Whether it only corrects the frame: depths are those that the free cameras see."""
-        return self.model in {"gimbal", "axis"}
+        return self.model in LOOSE
 
     def __str__(self) -> str:
         turn = {
@@ -237,9 +240,7 @@ class Trial:
 
     def _unexplained(self, path: Path) -> float:
         """Return which part of the rotation variance of the free cameras a path leaves."""
-        spread = ((self.rotations - self.rotations.mean(axis=0)) ** 2).sum(axis=(1, 2)).mean()
-        # ||G - H||_F^2 is twice the squared angle between G and H, to second order.
-        return 2.0 * path.unexplained / max(float(spread), np.finfo(float).tiny)
+        return so3.part_of_rotation(path.unexplained, self.rotations)
 
     def judge(self, path: Path) -> Verdict:
         """Put a path to the tests."""
