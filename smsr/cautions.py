@@ -31,7 +31,7 @@ _GROWING = 1.25
 _GROWING_IN_DOUBT = 1.5
 _LITTLE_ROTATION = math.radians(10.0)
 _SEEN_AROUND = math.radians(150.0)
-_KEEP_REVERSALS = LOOSE | {"flat"}
+_KEEP_REVERSALS = LOOSE | {"flat", "shaken"}
 
 
 def input_cautions(

@@ -65,6 +65,13 @@ class Deformation:
         """The inverse of the covariance."""
         return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
+    def temporal_precision(self, frames: int) -> tuple[NDArray[np.float64], float]:
+        """Return diagonal (T,) and off-diagonal of the inverse of ``a^|s - t|``, T >= 2."""
+        scale = 1.0 / (1.0 - self.correlation**2)
+        diagonal = np.full(frames, (1.0 + self.correlation**2) * scale)
+        diagonal[[0, -1]] = scale
+        return diagonal, -self.correlation * scale
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
@@ -147,18 +154,14 @@ def likely_shapes(
     hook : callable
         See `smsr.progress.StageHook`.
     """
-    frames, _, points = shapes.shape
+    frames = len(shapes)
     seen = rotations[:, :2] @ shapes
-    axis, planar = _as_seen(rotations, seen)
-    depths = depths_along(axis, shapes)
+    axis, planar = as_seen(rotations, seen)
+    latest = [depths_along(axis, shapes)]
     flat = shapes.reshape(frames, -1)
     size = float(np.linalg.norm(flat - flat.mean(axis=0)))
-    variance = floor**2 * float((shapes**2).sum()) / (3 * frames)
-    certain = np.zeros((frames, points, points))
-    posterior = Posterior(depths, certain, certain[1:])
-    deformation = Deformation(flat.mean(axis=0), np.eye(3 * points), _FIRST_CORRELATION)
-    deformation = _learn(deformation, shapes, axis, posterior, variance, keep_correlation=True)
-    latest = [depths]
+    variance = least_variance(shapes, floor)
+    deformation = first_model(shapes, axis, variance)
     # Lengths hold on to depths that they find: a face that still was too flat stayed so.
     joins = math.ceil(_ROUNDS_WITHOUT_LENGTHS * max_iterations)
     fewest, support = _FEWEST_ROUNDS, 0.0
@@ -175,7 +178,7 @@ def likely_shapes(
         if adjustment is not None and _ROUNDS_WITHOUT_TURNS < iteration <= joins:
             turned = adjustment.step(turning_force(deformation, planar, rotations, posterior))
             rotations = adjustment.rotations()
-            axis, planar = _as_seen(rotations, seen)
+            axis, planar = as_seen(rotations, seen)
         # The first steps are as small as the least variance is, whatever is still to come.
         settled = iteration >= fewest and change < tolerance and turned <= SETTLED
         if iteration == max_iterations or (settled and complete):
@@ -186,16 +189,46 @@ def likely_shapes(
         if len(latest) == 3:
             latest = [extrapolated(*latest)]
         shapes = planar + axis[:, :, None] * latest[-1][:, None]
-        deformation = _learn(deformation, shapes, axis, posterior, variance)
+        deformation = learnt(deformation, shapes, axis, posterior, variance)
     shapes = planar + axis[:, :, None] * latest[-1][:, None]
     return LikelyShapes(shapes, deformation, iteration, change, support)
 
 
-def _as_seen(
+def as_seen(
     rotations: NDArray[np.float64], seen: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return viewing directions (T, 3) and the shapes of zero depth (T, 3, q)."""
+    """Return viewing directions (T, 3) and the shapes of zero depth (T, 3, q).
+
+    Parameters
+    ----------
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras completed by the viewing direction.
+    seen : ndarray of shape (T, 2, q)
+        The tracks.
+    """
     return np.ascontiguousarray(rotations[:, 2]), rotations[:, :2].transpose(0, 2, 1) @ seen
+
+
+def least_variance(shapes: NDArray[np.float64], floor: float) -> float:
+    """Return the variance that a floor, see `likely_shapes`, stands for."""
+    return floor**2 * float((shapes**2).sum()) / (3 * len(shapes))
+
+
+def first_model(
+    shapes: NDArray[np.float64], axis: NDArray[np.float64], variance: float
+) -> Deformation:
+    """Return the model of shapes (T, 3, q) that are taken for certain, with a least variance."""
+    frames, _, points = shapes.shape
+    flat = shapes.reshape(frames, -1)
+    certain = np.zeros((frames, points, points))
+    return learnt(
+        Deformation(flat.mean(axis=0), np.eye(3 * points), _FIRST_CORRELATION),
+        shapes,
+        axis,
+        Posterior(depths_along(axis, shapes), certain, certain[1:]),
+        variance,
+        keep_correlation=True,
+    )
 
 
 def extrapolated(
@@ -240,19 +273,61 @@ def condition(
     evidence : Evidence, optional
         What is known of the depths beside.
     """
+    diagonal, coupling, force = _chain(deformation, planar, axis)
+    if evidence is not None:
+        diagonal += evidence.precision
+        force += evidence.force
+    return _posterior(diagonal, coupling, force)
+
+
+def _chain(
+    deformation: Deformation, planar: NDArray[np.float64], axis: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the precision of the depths and its product with their mean, as for `_posterior`."""
     frames, _, points = planar.shape
-    here, ahead = _temporal_precision(frames, deformation.correlation)
+    here, ahead = deformation.temporal_precision(frames)
     precision = deformation.precision
     blocks = _by_axes(precision, points)
     diagonal = (_outer(axis, axis) * here[:, None] @ blocks).reshape(frames, points, points)
     coupling = (ahead * _outer(axis[:-1], axis[1:]) @ blocks).reshape(-1, points, points)
     pull = (planar.reshape(frames, -1) - deformation.mean) @ precision
     pull = _through_time(pull, here, ahead).reshape(frames, 3, points)
-    force = -depths_along(axis, pull)
-    if evidence is not None:
-        diagonal += evidence.precision
-        force += evidence.force
-    return _posterior(diagonal, coupling, force)
+    return diagonal, coupling, -depths_along(axis, pull)
+
+
+def log_likelihood(
+    deformation: Deformation, planar: NDArray[np.float64], axis: NDArray[np.float64]
+) -> float:
+    """Return the logarithm of the density of the tracks, by coordinate and but for a constant.
+
+    The density of any shapes over that of their depths given the tracks, both at the mean of these.
+
+    Parameters
+    ----------
+    deformation : Deformation
+        The model.
+    planar : ndarray of shape (T, 3, q)
+        The shapes of zero depth, R^+ W, T >= 2.
+    axis : ndarray of shape (T, 3)
+        Viewing directions.
+    """
+    frames, _, points = planar.shape
+    diagonal, coupling, force = _chain(deformation, planar, axis)
+    depths = _posterior(diagonal, coupling, force).depths
+    of_depths, block = 0.0, diagonal[0]
+    for t in range(frames):
+        of_depths += float(np.linalg.slogdet(block)[1])
+        if t < frames - 1:
+            block = diagonal[t + 1] - coupling[t].T @ np.linalg.solve(block, coupling[t])
+    here, ahead = deformation.temporal_precision(frames)
+    shapes = planar + axis[:, :, None] * depths[:, None]
+    deviation = shapes.reshape(frames, -1) - deformation.mean
+    pull = _through_time(deviation @ deformation.precision, here, ahead)
+    of_shapes = frames * float(np.linalg.slogdet(deformation.covariance)[1])
+    of_shapes += 3 * points * (frames - 1) * math.log1p(-(deformation.correlation**2))
+    total = float((deviation * pull).sum()) + of_shapes + of_depths
+    likelihood: float = -total / (4 * frames * points)
+    return likelihood
 
 
 def _posterior(
@@ -349,7 +424,7 @@ def turning_force(
     """
     frames, _, points = planar.shape
     axis = rotations[:, 2]
-    here, ahead = _temporal_precision(frames, deformation.correlation)
+    here, ahead = deformation.temporal_precision(frames)
     precision = deformation.precision
     shapes = planar + axis[:, :, None] * posterior.depths[:, None]
     pull = _through_time(
@@ -372,7 +447,7 @@ def turning_force(
 def _through_time(
     rows: NDArray[np.float64], here: NDArray[np.float64], ahead: float
 ) -> NDArray[np.float64]:
-    """Multiply rows (T, n) by the tridiagonal matrix of `_temporal_precision`."""
+    """Multiply rows (T, n) by the tridiagonal matrix of `Deformation.temporal_precision`."""
     product = here[:, None] * rows
     product[:-1] += ahead * rows[1:]
     product[1:] += ahead * rows[:-1]
@@ -395,7 +470,7 @@ def _inverse(matrix: NDArray[np.float64], below: NDArray[np.bool_]) -> NDArray[n
     return inverse
 
 
-def _learn(
+def learnt(
     deformation: Deformation,
     shapes: NDArray[np.float64],
     axis: NDArray[np.float64],
@@ -408,6 +483,21 @@ def _learn(
 
     The correlation is not the likeliest, but that of all directions of the former model alike:
     directions that hardly move are near the least variance, and would have it near 1.
+
+    Parameters
+    ----------
+    deformation : Deformation
+        The former model.
+    shapes : ndarray of shape (T, 3, q)
+        S of the mean depths.
+    axis : ndarray of shape (T, 3)
+        Viewing directions.
+    posterior : Posterior
+        Of the depths, see `condition`.
+    variance : float
+        See `least_variance`.
+    keep_correlation : bool
+        Leave the correlation as it was.
     """
     frames = len(shapes)
     flat = shapes.reshape(frames, -1)
@@ -434,14 +524,6 @@ def _learn(
     covariance = 0.5 * (covariance + covariance.T)
     covariance[np.diag_indices_from(covariance)] += variance
     return Deformation(mean, covariance, correlation)
-
-
-def _temporal_precision(frames: int, correlation: float) -> tuple[NDArray[np.float64], float]:
-    """Return diagonal (T,) and off-diagonal of the inverse of ``a^|s - t|``, T >= 2."""
-    scale = 1.0 / (1.0 - correlation**2)
-    diagonal = np.full(frames, (1.0 + correlation**2) * scale)
-    diagonal[[0, -1]] = scale
-    return diagonal, -correlation * scale
 
 
 def _outer(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:

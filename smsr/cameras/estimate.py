@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+STILL = math.radians(3.0)
+"""Cameras whose viewing directions spread less than this stand still."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraEstimate:
@@ -24,8 +28,8 @@ class CameraEstimate:
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     model : str
-        How they were found: 'relaxed', 'flat', 'uniform', 'switched', 'accelerated', 'eased',
-        'swinging', 'axis', 'gimbal', 'rigid' or 'paper'.
+        How they were found: 'relaxed', 'flat', 'shaken', 'uniform', 'switched', 'accelerated',
+        'eased', 'swinging', 'axis', 'gimbal', 'rigid' or 'paper'.
     basis_size : int
         K, the number of column triplets of the corrective matrix.
     iterations : int
@@ -40,7 +44,7 @@ class CameraEstimate:
         Numbers that the choice was based on, see `smsr.cameras.free` and
         `smsr.cameras.selection`.
     flat : bool
-        Whether they come from a flat mean shape, see `smsr.cameras.flat`.
+        Whether they come, or started, from a flat mean shape, see `smsr.cameras.flat`.
     coherent : bool
         Whether a simple path of the camera made the object move no more.
     simpler : ndarray of shape (T, 3, 3), optional

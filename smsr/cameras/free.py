@@ -15,12 +15,12 @@ import numpy as np
 
 from smsr import rotations as so3
 from smsr.cameras.constraints import orthonormality_form
-from smsr.cameras.estimate import scaled_motion, usable_rank
+from smsr.cameras.estimate import STILL, scaled_motion, usable_rank
 from smsr.cameras.flat import flat_views, steadier
+from smsr.cameras.likeliest import FROM_NEAR, likeliest_cameras, shaken_cameras
 from smsr.cameras.relaxed import relaxed_cameras
-from smsr.cameras.rigid import part_beyond
+from smsr.cameras.simplicity import complexity, simplest_shapes
 from smsr.progress import ignore, part_of
-from smsr.shapes import DepthProblem, steadiness
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from smsr.cameras.estimate import CameraEstimate
     from smsr.cameras.flat import FlatViews
     from smsr.progress import StageHook
+    from smsr.shapes import DepthProblem
 
 RELAXATIONS = ((10, 1e-3), (3, 1e-3), (2, 1e-3), (10, 4e-3), (10, 1.6e-2))
 """Basis size and trace weight of the relaxations that are tried; mostly the first is right, with
@@ -38,11 +39,8 @@ _NOISY = 0.02  # noise, as a part of the tracks' spread, from which on its weigh
 
 _LIGHTER = (0.3, 0.1, 0.03)
 """Parts of the first weight that are tried as well, for as long as the shapes get simpler: a heavy
-trace makes cameras that turn little stand still, a light one fits noise."""
-
-_STILL = math.radians(3.0)
-"""Cameras whose viewing directions spread less than this stand still, and a trace lighter than that
-which holds them may yet let them turn."""
+trace makes cameras that turn little stand still, and one lighter than that which holds them may
+still let them turn; a light one fits noise."""
 
 _TOO_NOISY = 0.1
 """Noise, as a part of the tracks' spread, from which on simple shapes tell nothing of the trace."""
@@ -68,19 +66,15 @@ must be apart, the more so where these are certain, whatever reversals there may
 reversals and much simpler."""
 
 _SIMPLE = 0.5
-_HARDLY_DEFORMING = 0.03
-_STEADY_SHAPES, _UNSTEADY_SHAPES = 0.95, 0.5
-"""Complexity from which on, where three directions leave at least the second of the tracks, the
-steadiness of the shapes counts as well: above the third with the cameras of a flat mean shape and
-below the fourth with relaxed ones, those are taken."""
+"""Complexity below which a camera that shakes is no reason to look further."""
+
+_RELAXATIONS = 0.6  # part of the progress
 
 _FROM_THE_FRONT = math.sin(math.radians(30.0))
 """Tilt of a plane below which the tracks hardly tell which side is up."""
 
 _AGREEMENT = math.radians(6.0)
 _AS_GOOD = 1.05  # relaxations of complexities within this factor are equally likely
-_FRAMES = 200
-_DIRECTIONS = 18
 
 
 def free_cameras(
@@ -89,7 +83,7 @@ def free_cameras(
     *,
     basis_size: int | None = None,
     noise: float = 0.0,
-    may_be_flat: bool = True,
+    relaxations_only: bool = False,
     max_iterations: int = 500,
     tolerance: float = 1e-6,
     hook: StageHook = ignore,
@@ -108,8 +102,8 @@ def free_cameras(
         Noise that was taken off, as a part of the tracks' spread. The trace shortens the depth
         that cameras see and lets them drift, but steadies them where the tracks are uncertain: the
         less noise, the less weight of the trace in the first relaxation.
-    may_be_flat : bool
-        Look for a flat mean shape, too, unless K is known.
+    relaxations_only : bool
+        Look neither for a flat mean shape nor for a camera that shakes, as where K is known.
     max_iterations, tolerance, hook
         As for `smsr.cameras.relaxed.relaxed_cameras`.
 
@@ -121,7 +115,9 @@ def free_cameras(
         shapes are so simple that the cameras are certain. Of a flat mean shape they are
         ``relaxed_complexity``, that of the best relaxation, ``width_is_determined``, 0 where it is
         as if the object had been seen from the front once, and ``frontal_views``, how often it
-        is, instead of the second.
+        is, instead of the second. Of a camera that shakes they are ``relaxed_complexity``,
+        ``steadiness``, see `smsr.shapes.steadiness`, and ``relaxed_steadiness``; and
+        ``frontal_views``, if it sees a flat mean shape.
     """
     most = max(1, len(values) // 3)
     share = min(noise / _NOISY, 1.0) ** 2
@@ -136,7 +132,7 @@ def free_cameras(
     largest = usable_rank(values, 3 * size)
     form = orthonormality_form(scaled_motion(left, values, largest), unit_scale=True)
     measurements = left * values
-    found: list[_Relaxation] = []
+    tried: list[_Relaxation] = []
 
     def relax(K: int, weight: float) -> _Relaxation:
         count = len(ladder) + len(others)
@@ -148,19 +144,24 @@ def free_cameras(
             form=form,
             max_iterations=max_iterations,
             tolerance=tolerance,
-            hook=part_of(hook, len(found) / count, (len(found) + 1) / count),
+            hook=part_of(
+                hook,
+                _RELAXATIONS * len(tried) / count,
+                _RELAXATIONS * (len(tried) + 1) / count,
+            ),
         )
         reason = f"relaxation with K = {K} and trace weight {weight:g}: {estimate.reason}"
         estimate = dataclasses.replace(estimate, reason=reason)
-        found.append(_Relaxation(estimate, complexity(measurements, estimate.rotations)))
-        return found[-1]
+        problem = simplest_shapes(measurements, estimate.rotations)
+        tried.append(_Relaxation(estimate, problem, problem.complexity()))
+        return tried[-1]
 
     first = best = relax(*ladder[0])
     for setting in ladder[1:]:
         lighter = relax(*setting)
         if lighter.complexity < best.complexity and lighter.estimate.converged:
             best = lighter
-        elif so3.spread_of_views(lighter.estimate.rotations) > _STILL:
+        elif so3.spread_of_views(lighter.estimate.rotations) > STILL:
             break
     doubtful = best.complexity >= _CERTAIN
     for K, weight in others if doubtful else []:
@@ -171,57 +172,60 @@ def free_cameras(
             break
     angles = [
         angle_between(best.estimate.rotations, other.estimate.rotations)
-        for other in found
+        for other in tried
         if doubtful and other.complexity <= _AS_GOOD * best.complexity
     ]
     disagreement = math.degrees(max(angles, default=0.0))
-    if may_be_flat and basis_size is None and best.complexity > _NEARLY_RIGID:
-        flat = _of_flat_shape(best, left, values)
-        if flat is not None:
-            return flat
-    return dataclasses.replace(
-        best.estimate,
-        criteria={"complexity": best.complexity, "disagreement": disagreement},
-    )
+    criteria = {"complexity": best.complexity, "disagreement": disagreement}
+    found = dataclasses.replace(best.estimate, criteria=criteria)
+    if relaxations_only or basis_size is not None or best.complexity <= _NEARLY_RIGID:
+        return found
+    return _beyond_relaxations(found, best, left, values, noise, part_of(hook, _RELAXATIONS, 1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relaxation:
-    """Cameras, and the complexity of the shapes they give."""
+    """Cameras, the simplest shapes they give, and the complexity of these."""
 
     estimate: CameraEstimate
+    problem: DepthProblem
     complexity: float
 
 
+def _beyond_relaxations(
+    found: CameraEstimate,
+    relaxed: _Relaxation,
+    left: NDArray[np.float64],
+    values: NDArray[np.float64],
+    noise: float,
+    hook: StageHook,
+) -> CameraEstimate:
+    """Return the cameras of a flat mean shape, or that shake, where the relaxed ones failed."""
+    measurements = left * values
+    views = flat_views(left, values)
+    flat = None if views is None else _of_flat_shape(views, relaxed, measurements)
+    shaken = _of_shaken_camera(views, relaxed, measurements, noise, hook)
+    if shaken is not None:
+        return shaken
+    if flat is None or noise >= _TOO_NOISY:
+        return flat or found
+    rotations = likeliest_cameras(measurements, flat.rotations, FROM_NEAR, hook)
+    return dataclasses.replace(flat, rotations=rotations)
+
+
 def _of_flat_shape(
-    relaxed: _Relaxation, left: NDArray[np.float64], values: NDArray[np.float64]
+    views: FlatViews, relaxed: _Relaxation, measurements: NDArray[np.float64]
 ) -> CameraEstimate | None:
     """Return the cameras of a flat mean shape where the relaxations failed on one."""
-    views = flat_views(left, values)
-    if views is None:
-        return None
-    measurements, before = left * values, relaxed.complexity
-    problem = _simplest_shapes(measurements, views.rotations)
-    now = problem.complexity()
+    before = relaxed.complexity
+    now = complexity(measurements, views.rotations)
     if now >= before:
         return None
-    simpler = False
-    if not _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
-        views = steadier(views)
-        problem = _simplest_shapes(measurements, views.rotations)
-        now = problem.complexity()
-        simpler = now < _CLEARLY_SIMPLER * before and (now < _CREDIBLE_FLAT or before > 1.0)
-    if simpler:
-        reason = f"give shapes that are {1.0 - now / before:.0%} simpler"
-    elif (
-        before >= _SIMPLE
-        and part_beyond(values) > _HARDLY_DEFORMING
-        and _steadiness(problem) > _STEADY_SHAPES
-        and _steadiness(_simplest_shapes(measurements, relaxed.estimate.rotations))
-        < _UNSTEADY_SHAPES
-    ):
-        reason = "explain the shake of the tracks better"
-    else:
+    if _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
+        return None
+    views = steadier(views)
+    now = complexity(measurements, views.rotations)
+    if now >= _CLEARLY_SIMPLER * before or (now >= _CREDIBLE_FLAT and before <= 1.0):
         return None
     return dataclasses.replace(
         relaxed.estimate,
@@ -233,11 +237,56 @@ def _of_flat_shape(
             "complexity": now,
             "relaxed_complexity": before,
             "width_is_determined": float(views.determined),
-            "frontal_views": float(len(views.frontal_frames(_FROM_THE_FRONT))),
+            "frontal_views": _frontal_views(views),
         },
-        reason=f"the mean shape is flat, and cameras that see it as a plane {reason} than those "
-        f"of the best {relaxed.estimate.reason}",
+        reason="the mean shape is flat, and cameras that see it as a plane give shapes that are "
+        f"{1.0 - now / before:.0%} simpler than those of the best {relaxed.estimate.reason}",
     )
+
+
+def _of_shaken_camera(
+    views: FlatViews | None,
+    relaxed: _Relaxation,
+    measurements: NDArray[np.float64],
+    noise: float,
+    hook: StageHook,
+) -> CameraEstimate | None:
+    """Return the likeliest cameras where the relaxed ones leave a shake of the tracks unexplained.
+
+    From these and those of a plane, since each may be far off.
+    """
+    if relaxed.complexity < _SIMPLE:
+        return None
+    starts = [relaxed.estimate.rotations]
+    if views is not None:
+        starts.append(steadier(views).rotations)
+    shaken = shaken_cameras(measurements, starts, relaxed.problem, noise, hook)
+    if shaken is None:
+        return None
+    criteria = {
+        "complexity": shaken.complexity,
+        "relaxed_complexity": relaxed.complexity,
+        "steadiness": shaken.steadiness,
+        "relaxed_steadiness": shaken.former_steadiness,
+    }
+    near = "those"
+    if views is not None and shaken.start > 0:
+        near = "those that see the object as a plane, and not near those"
+        criteria["frontal_views"] = _frontal_views(views)
+    return dataclasses.replace(
+        relaxed.estimate,
+        rotations=shaken.rotations,
+        model="shaken",
+        flat=shaken.start > 0,
+        criteria=criteria,
+        reason="the tracks shake as those of a camera that is held in the hand, and are likeliest "
+        f"for cameras near {near} of the best {relaxed.estimate.reason}",
+    )
+
+
+def _frontal_views(views: FlatViews) -> float:
+    """Return after how many views from the front the plane may be reversed."""
+    return float(len(views.frontal_frames(_FROM_THE_FRONT)))
 
 
 def _is_the_same(views: FlatViews, relaxed: _Relaxation, *, far_simpler: bool) -> bool:
@@ -247,11 +296,6 @@ def _is_the_same(views: FlatViews, relaxed: _Relaxation, *, far_simpler: bool) -
     if angle_between(cameras, views.nearest_to(cameras).rotations) >= limit:
         return False
     return not far_simpler or angle_between(cameras, views.rotations) < _FAR_APART
-
-
-def _steadiness(problem: DepthProblem) -> float:
-    """Return what the steadiness of the best shapes says for their cameras."""
-    return steadiness(problem.shapes.reshape(problem.frames, 3, -1), problem.rotations)
 
 
 def _agree(first: _Relaxation, second: _Relaxation) -> bool:
@@ -268,42 +312,6 @@ def _is_clearly_simpler(other: _Relaxation, first: _Relaxation) -> bool:
     """Tell whether a relaxation gives so much simpler shapes that the first has failed."""
     clear = other.complexity < _CLEARLY_LOWER * first.complexity
     return clear and (other.complexity < _CREDIBLE or first.complexity > 1.0)
-
-
-def complexity(measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> float:
-    """Return the nuclear norm of the best shapes for some cameras over that of the tracks.
-
-    With wrong cameras the object has another shape in every frame; with right ones a few basis
-    shapes do. Slow drift of the cameras hardly shows in it.
-
-    Parameters
-    ----------
-    measurements : ndarray of shape (2T, q)
-        Virtual points, strongest first.
-    rotations : ndarray of shape (T, 3, 3)
-        Cameras completed by the viewing direction.
-    """
-    return _simplest_shapes(measurements, rotations).complexity()
-
-
-def _simplest_shapes(
-    measurements: NDArray[np.float64], rotations: NDArray[np.float64]
-) -> DepthProblem:
-    """Return the problem of the best shapes, solved roughly on some frames and directions."""
-    step = math.ceil(len(rotations) / _FRAMES)
-    problem = DepthProblem(
-        every_frame(measurements, step)[:, :_DIRECTIONS], np.ascontiguousarray(rotations[::step])
-    )
-    problem.minimise(60, 3e-4)
-    return problem
-
-
-def every_frame(measurements: NDArray[np.float64], step: int) -> NDArray[np.float64]:
-    """Return the measurements (2T', N) of every n-th frame."""
-    if step == 1:
-        return measurements
-    points = measurements.shape[1]
-    return measurements.reshape(-1, 2, points)[::step].reshape(-1, points)
 
 
 def angle_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smsr.cameras.free import every_frame, free_cameras
+from smsr.cameras.free import free_cameras
 from smsr.cameras.paper import published_cameras
 from smsr.cameras.rigid import looks_rigid, rigid_cameras
+from smsr.cameras.simplicity import every_frame
 from smsr.cameras.trial import Trial
 from smsr.cameras.turn import refine_velocity
 from smsr.progress import ignore, part_of
@@ -103,7 +104,7 @@ def estimate_cameras(
         values,
         basis_size=options.basis_size,
         noise=noise,
-        may_be_flat=options.camera_model != "relaxed",
+        relaxations_only=options.camera_model == "relaxed",
         max_iterations=options.camera_iterations,
         tolerance=options.camera_tolerance,
         hook=part_of(hook, 0.0, 0.5),

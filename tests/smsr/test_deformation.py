@@ -14,6 +14,7 @@ from smsr.deformation import (
     condition,
     extrapolated,
     likely_shapes,
+    log_likelihood,
     turning_force,
 )
 from smsr.lengths import Evidence, Lengths
@@ -54,7 +55,7 @@ def without_depth(shapes: Array, rotations: Array) -> Array:
     return flat
 
 
-def log_likelihood(deformation: Deformation, shapes: Array, rotations: Array) -> float:
+def dense_log_likelihood(deformation: Deformation, shapes: Array, rotations: Array) -> float:
     """Return that of what the cameras see of the shapes, from the covariance of all of it."""
     frames = len(shapes)
     in_time = temporal_covariance(frames, deformation.correlation)
@@ -142,6 +143,19 @@ class TestCondition:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
+@pytest.mark.parametrize("frames", [2, 5])
+def test_the_likelihood_is_that_of_the_joint_gaussian(frames: int, correlation: float) -> None:
+    deformation, rotations = model(3, correlation), turning(frames, 20.0)
+    values = []
+    for seed in (1, 2):
+        shapes = sample(deformation, frames, seed)
+        found = log_likelihood(deformation, without_depth(shapes, rotations), rotations[:, 2])
+        values.append((found, dense_log_likelihood(deformation, shapes, rotations)))
+    for found, dense in values:
+        assert found * 2 * frames * 3 == pytest.approx(dense, rel=1e-8)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
 def test_turning_force_is_the_gradient_of_the_likelihood(correlation: float) -> None:
     deformation, rotations = model(3, correlation), turning(5, 20.0)
     shapes = sample(deformation, 5)
@@ -156,7 +170,7 @@ def test_turning_force_is_the_gradient_of_the_likelihood(correlation: float) -> 
         there, back = (so3.exp(sign * turn) @ rotations for sign in (1.0, -1.0))
         # What the cameras see stays: they see it of other shapes.
         values = [
-            log_likelihood(deformation, R.transpose(0, 2, 1) @ (rotations @ shapes), R)
+            dense_log_likelihood(deformation, R.transpose(0, 2, 1) @ (rotations @ shapes), R)
             for R in (there, back)
         ]
         expected[t, axis] = (values[0] - values[1]) / (2.0 * step)
@@ -275,7 +289,7 @@ class TestLikelyShapes:
             np.testing.assert_allclose(
                 (rotations[:, :2] @ found.shapes).reshape(W.shape), W, atol=1e-9
             )
-            values.append(log_likelihood(found.deformation, found.shapes, rotations))
+            values.append(dense_log_likelihood(found.deformation, found.shapes, rotations))
         assert values[1] > values[0] + 5.0
 
     @pytest.mark.parametrize("scale", [1e-4, 1e3])

@@ -1,0 +1,250 @@
+"""Cameras turned, frame by frame, to where they make the tracks likeliest.
+
+The simplest shapes do not tell of a camera that turns by some degrees only, and with a little noise
+they lead it astray. If it shakes, as one that is held in the hand, the tracks tell all the same: no
+object moves to and fro from frame to frame as its image does then. The Gaussian model of the
+deformation (`smsr.deformation`), in which consecutive shapes are alike, puts a number on it, and
+the cameras follow its gradient together with the depths. A camera that turns slowly must not be
+left to it: what the object does as slowly is then as likely the camera's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from smsr import rotations as so3
+from smsr.cameras.estimate import STILL
+from smsr.cameras.simplicity import roughly_solved, simplest_shapes, steadiness_of
+from smsr.deformation import (
+    as_seen,
+    condition,
+    first_model,
+    learnt,
+    least_variance,
+    likely_shapes,
+    log_likelihood,
+    turning_force,
+)
+from smsr.progress import ignore, part_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from smsr.deformation import Deformation
+    from smsr.progress import StageHook
+    from smsr.shapes import DepthProblem
+
+FROM_FAR = ((0.03, 100), (0.01, 30), (0.005, 20), (0.0025, 20))
+"""Floors of the model, and rounds with each, that lead from cameras which may be off by tens of
+degrees: a high one lets them go far, a low one tells small errors."""
+
+FROM_NEAR = ((0.01, 40), (0.005, 20), (0.0025, 20))
+"""The same from cameras that are nearly right."""
+
+_DIRECTIONS = 18
+_ROUNDS_WITHOUT_TURNS = 5  # until the model has left the shapes that it was learnt from first
+_LONGEST_STEP = math.radians(3.0)
+_LEAST_CURVATURE = 1e-3  # of the mean one
+
+_JUDGING_FLOOR, _JUDGING_ROUNDS, _JUDGING_TOLERANCE = 0.01, 15, 5e-4
+_ROUGH = 0.35  # second over first differences of the tracks, squared
+_SLOWLY = 0.9  # correlation of consecutive shapes
+_STEADY = 0.6  # steadiness of shapes from which on their cameras need no help
+_STEADIER = 0.05
+_CREDIBLE, _CREDIBLE_BY_NOISE = 0.15, 1.5  # steadiness below which likelier cameras are none
+
+
+def likeliest_cameras(
+    measurements: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    stages: Sequence[tuple[float, int]],
+    hook: StageHook = ignore,
+) -> NDArray[np.float64]:
+    """Turn the cameras of all frames, each by itself, to where they make the tracks likelier.
+
+    Each stage starts from the simplest shapes. In each of its rounds, the depths given the tracks
+    are found, the cameras take a Newton step up the expected log-likelihood, and the model is
+    learnt anew.
+
+    Parameters
+    ----------
+    measurements : ndarray of shape (2T, q)
+        Virtual points, strongest first, T >= 2; the first 18 count.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras to start from, completed by the viewing direction.
+    stages : sequence of pairs
+        Floor of the model, see `smsr.deformation.likely_shapes`, and number of rounds.
+    hook : callable
+        See `smsr.progress.StageHook`.
+
+    Returns
+    -------
+    ndarray of shape (T, 3, 3)
+    """
+    some = np.ascontiguousarray(measurements[:, :_DIRECTIONS])
+    seen = some.reshape(len(rotations), 2, -1)
+    count, done = sum(rounds for _, rounds in stages), 0
+    for floor, rounds in stages:
+        problem = roughly_solved(some, np.ascontiguousarray(rotations))
+        shapes = problem.shapes.reshape(len(rotations), 3, -1)
+        axis, planar = as_seen(rotations, seen)
+        variance = least_variance(shapes, floor)
+        model = first_model(shapes, axis, variance)
+        for iteration in range(1, rounds + 1):
+            posterior = condition(model, planar, axis)
+            longest = 0.0
+            if iteration > _ROUNDS_WITHOUT_TURNS:
+                shapes = planar + axis[:, :, None] * posterior.depths[:, None]
+                force = turning_force(model, planar, rotations, posterior)
+                turns = _newton_step(model, rotations, shapes, force)
+                longest = float(np.linalg.norm(turns, axis=1).max())
+                turns *= min(1.0, _LONGEST_STEP / max(longest, np.finfo(float).tiny))
+                rotations = so3.exp(turns) @ rotations
+                axis, planar = as_seen(rotations, seen)
+            shapes = planar + axis[:, :, None] * posterior.depths[:, None]
+            model = learnt(model, shapes, axis, posterior, variance)
+            done += 1
+            hook(done / count, done, longest)
+    return rotations
+
+
+def _newton_step(
+    deformation: Deformation,
+    rotations: NDArray[np.float64],
+    shapes: NDArray[np.float64],
+    force: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the turns (T, 3) of the cameras that the gradient (T, 3) leads to.
+
+    The curvature is that of the log-density of the shapes with their depths held, which is more
+    than that of the tracks alone: steps are short rather than long.
+    """
+    frames, _, points = shapes.shape
+    seen = rotations @ shapes
+    moved = np.stack([-np.cross(axis, seen, axisb=1, axisc=1) for axis in np.eye(3)], axis=1)
+    moved = rotations.transpose(0, 2, 1)[:, None] @ moved
+    moved = moved.reshape(frames, 3, 3 * points)
+    here, ahead = deformation.temporal_precision(frames)
+    pull = moved @ deformation.precision
+    own = here[:, None, None] * (pull @ moved.transpose(0, 2, 1))
+    following = ahead * (pull[:-1] @ moved[1:].transpose(0, 2, 1))
+    own += _LEAST_CURVATURE * float(np.trace(own.mean(axis=0))) * np.eye(3)
+    # Lower diagonals of the block-tridiagonal matrix, as LAPACK wants them.
+    bands = np.zeros((6, 3 * frames))
+    for i in range(3):
+        for j in range(3):
+            if i >= j:
+                bands[i - j, j::3] = own[:, i, j]
+            bands[3 + i - j, j::3][: frames - 1] += following[:, j, i]
+    turns: NDArray[np.float64] = solveh_banded(bands, force.ravel(), lower=True).reshape(frames, 3)
+    return turns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShakenCameras:
+    """Cameras of which the shake of the tracks tells.
+
+    Attributes
+    ----------
+    rotations : ndarray of shape (T, 3, 3)
+        Completed by the viewing direction.
+    start : int
+        Which of the cameras to start from led there.
+    complexity : float
+        Of their shapes, see `smsr.cameras.simplicity`.
+    steadiness : float
+        Of their shapes, see `smsr.shapes.steadiness`,
+    former_steadiness : float
+        and of those of the first cameras to start from.
+    """
+
+    rotations: NDArray[np.float64]
+    start: int
+    complexity: float
+    steadiness: float
+    former_steadiness: float
+
+
+def shaken_cameras(
+    measurements: NDArray[np.float64],
+    starts: Sequence[NDArray[np.float64]],
+    problem: DepthProblem,
+    noise: float = 0.0,
+    hook: StageHook = ignore,
+) -> ShakenCameras | None:
+    """Return the likeliest cameras where the tracks are shaken and some cameras do not explain it.
+
+    Parameters
+    ----------
+    measurements : ndarray of shape (2T, q)
+        Virtual points, strongest first.
+    starts : sequence of ndarray of shape (T, 3, 3)
+        Cameras to start from, one at least.
+    problem : DepthProblem
+        Of the simplest shapes for the first ones, see `smsr.cameras.simplicity`.
+    noise : float
+        As a part of the tracks' spread: what is left of it shakes the tracks, too.
+    hook : callable
+        See `smsr.progress.StageHook`.
+
+    Returns
+    -------
+    ShakenCameras or None
+        None where the tracks are smooth, the object is as hasty as the camera, the shapes of the
+        first cameras are steady already, or the likeliest ones stand still or give no steadier
+        shapes.
+    """
+    if not _are_rough(measurements, len(starts[0])):
+        return None
+    before = steadiness_of(problem)
+    if before >= _STEADY or _Judged.of(problem).correlation < _SLOWLY:
+        return None
+    found = []
+    for i, start in enumerate(starts):
+        part = part_of(hook, i / len(starts), (i + 1) / len(starts))
+        rotations = likeliest_cameras(measurements, start, FROM_FAR, part)
+        found.append((_Judged.of(simplest_shapes(measurements, rotations)), i, rotations))
+    best, which, rotations = max(found, key=lambda one: one[0].log_likelihood)
+    credible = _CREDIBLE + _CREDIBLE_BY_NOISE * noise
+    if so3.spread_of_views(rotations) < STILL:
+        return None
+    steadiness = steadiness_of(best.problem)
+    if steadiness < max(before + _STEADIER, credible):
+        return None
+    return ShakenCameras(rotations, which, best.problem.complexity(), steadiness, before)
+
+
+def _are_rough(measurements: NDArray[np.float64], frames: int) -> bool:
+    """Tell whether the tracks go to and fro from frame to frame."""
+    seen = measurements.reshape(frames, -1)
+    first, second = (float((np.diff(seen, n=order, axis=0) ** 2).sum()) for order in (1, 2))
+    return second > _ROUGH * first
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """What a model of the deformation, learnt from the simplest shapes, says of their cameras."""
+
+    problem: DepthProblem
+    correlation: float
+    log_likelihood: float
+
+    @classmethod
+    def of(cls, problem: DepthProblem) -> _Judged:
+        shapes = problem.shapes.reshape(problem.frames, 3, -1)
+        model = likely_shapes(
+            shapes,
+            problem.rotations,
+            floor=_JUDGING_FLOOR,
+            max_iterations=_JUDGING_ROUNDS,
+            tolerance=_JUDGING_TOLERANCE,
+        ).deformation
+        axis, planar = as_seen(problem.rotations, problem.rotations[:, :2] @ shapes)
+        return cls(problem, model.correlation, log_likelihood(model, planar, axis))

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from smsr import rotations as so3
+from smsr.benchmark.camera_paths import errors
+from smsr.benchmark.sheets import sheet_tracks
+from smsr.cameras.flat import flat_views
+from smsr.cameras.free import angle_between, free_cameras
+from smsr.cameras.likeliest import FROM_FAR, FROM_NEAR, likeliest_cameras, shaken_cameras
+from smsr.cameras.simplicity import simplest_shapes
+from smsr.errors import Cancelled
+from smsr.pipeline import reconstruct
+from smsr.progress import ignore
+from tests.shaken import shaken
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smsr.cameras.likeliest import ShakenCameras
+
+    Array = NDArray[np.float64]
+
+
+def factored(W: Array, count: int = 18) -> tuple[Array, Array]:
+    """Return left singular vectors and singular values of tracks, the largest 1."""
+    left, values, _ = np.linalg.svd(W - W.mean(axis=1, keepdims=True), full_matrices=False)
+    count = min(count, int((values > 1e-9 * values[0]).sum()))
+    return left[:, :count], values[:count] / values[0]
+
+
+def tracks(frames: int = 120, seed: int = 0) -> tuple[Array, Array]:
+    """Return virtual points under a camera in the hand, and the cameras."""
+    W, true, _ = shaken(frames, seed=seed)
+    left, values = factored(W)
+    return left * values, true
+
+
+def turning_by(part: float, rotations: Array) -> Array:
+    """Return cameras that turn by a part of the angle only."""
+    middle = rotations[len(rotations) // 2]
+    turned: Array = so3.exp(part * so3.log(rotations @ middle.T)) @ middle
+    return turned
+
+
+class TestLikeliest:
+    @pytest.mark.parametrize(("part", "seed"), [(0.3, 0), (0.3, 1), (0.5, 2), (1.25, 1)])
+    def test_cameras_that_turn_too_little_or_too_much_are_mended(
+        self, part: float, seed: int
+    ) -> None:
+        measurements, true = tracks(seed=seed)
+        wrong = turning_by(part, true)
+        found = likeliest_cameras(measurements, wrong, FROM_FAR)
+        assert angle_between(found, true) < 0.5 * angle_between(wrong, true)
+        np.testing.assert_allclose(
+            found @ found.transpose(0, 2, 1), np.broadcast_to(np.eye(3), found.shape), atol=1e-9
+        )
+
+    def test_right_cameras_stay(self) -> None:
+        measurements, true = tracks()
+        found = likeliest_cameras(measurements, true, FROM_NEAR)
+        assert angle_between(found, true) < math.radians(1.0)
+
+    def test_the_size_of_the_tracks_does_not_matter(self) -> None:
+        measurements, true = tracks(60)
+        start, stages = turning_by(0.7, true), ((0.01, 8), (0.005, 8))
+        found = likeliest_cameras(measurements, start, stages)
+        other = likeliest_cameras(1e3 * measurements, start, stages)
+        np.testing.assert_allclose(other, found, atol=1e-6)
+
+    @pytest.mark.parametrize("sheet", ["paper", "cloth", "flag"])
+    def test_cameras_of_a_flat_shape_come_nearer(self, sheet: str) -> None:
+        """They are off by what the sheet bends."""
+        W, true, _ = sheet_tracks(sheet, "lissajous", seed=0)
+        left, values = factored(W)
+        views = flat_views(left, values)
+        assert views is not None
+        start = views.nearest_to(true).rotations
+        found = likeliest_cameras(left * values, start, FROM_NEAR)
+        assert angle_between(found, true) < 0.95 * angle_between(start, true)
+
+    def test_it_reports_and_can_be_stopped(self) -> None:
+        measurements, true = tracks(40)
+        reports: list[tuple[float, int]] = []
+
+        def hook(fraction: float, iteration: int, residual: float | None) -> None:
+            reports.append((fraction, iteration))
+            if iteration == 9:
+                raise Cancelled("enough", stage="cameras")
+
+        with pytest.raises(Cancelled):
+            likeliest_cameras(measurements, true, ((0.01, 6), (0.005, 6)), hook)
+        assert reports == [(i / 12, i) for i in range(1, 10)]
+
+
+def of_shaken(measurements: Array, *starts: Array, noise: float = 0.0) -> ShakenCameras | None:
+    problem = simplest_shapes(measurements, starts[0])
+    return shaken_cameras(measurements, starts, problem, noise, ignore)
+
+
+class TestShaken:
+    @pytest.mark.parametrize("seed", [0, 1, 2])
+    def test_a_shake_tells_of_cameras_that_turn_too_little(self, seed: int) -> None:
+        measurements, true = tracks(seed=seed)
+        wrong = turning_by(0.3, true)
+        found = of_shaken(measurements, wrong)
+        assert found is not None
+        assert found.steadiness > found.former_steadiness + 0.3
+        assert angle_between(found.rotations, true) < 0.5 * angle_between(wrong, true)
+
+    def test_of_two_starts_the_likelier_end_counts(self) -> None:
+        measurements, true = tracks()
+        rng = np.random.default_rng(0)
+        astray = so3.exp(np.cumsum(0.2 * rng.standard_normal((len(true), 3)), axis=0))
+        found = of_shaken(measurements, astray, turning_by(0.3, true))
+        assert found is not None
+        assert found.start == 1
+
+    def test_right_cameras_need_no_help(self) -> None:
+        measurements, true = tracks()
+        assert of_shaken(measurements, true) is None
+
+    def test_smooth_tracks_tell_nothing(self) -> None:
+        _, _, shapes = shaken()
+        slow = so3.exp(np.linspace(0.0, 0.5, len(shapes))[:, None] * np.array([0.1, 1.0, 0.0]))
+        left, values = factored((slow[:, :2] @ shapes).reshape(2 * len(shapes), -1))
+        assert of_shaken(left * values, turning_by(0.3, slow)) is None
+
+    def test_nor_do_those_of_a_hasty_object(self) -> None:
+        W, true, shapes = shaken()
+        order = np.random.default_rng(0).permutation(len(shapes))
+        left, values = factored((true[:, :2] @ shapes[order]).reshape(W.shape))
+        assert of_shaken(left * values, turning_by(0.3, true)) is None
+
+    def test_the_more_noise_the_steadier_they_must_be(self) -> None:
+        measurements, true = tracks()
+        assert of_shaken(measurements, turning_by(0.3, true), noise=0.6) is None
+
+
+class TestFreeCamerasThatShake:
+    @pytest.mark.parametrize("seed", [1, 2, 5])
+    def test_a_little_noise_leads_them_astray_no_more(self, seed: int) -> None:
+        W, rotations, shapes = shaken(seed=seed)
+        W += 0.005 * np.abs(W).max() * np.random.default_rng(seed).standard_normal(W.shape)
+        result, relaxed = (reconstruct(W, camera_model=model) for model in ("auto", "relaxed"))
+        found, without = (
+            errors(each.cameras, each.shapes.transpose(0, 2, 1), rotations, shapes).camera
+            for each in (result, relaxed)
+        )
+        assert found < 0.3 < 0.6 < without
+        diagnostics = result.diagnostics
+        assert diagnostics.camera_model == "shaken"
+        assert "held in the hand" in diagnostics.camera_reason
+        criteria = diagnostics.camera_criteria
+        assert criteria["steadiness"] > 0.5 > criteria["relaxed_steadiness"]
+        assert "weak-depth" not in {caution.code for caution in diagnostics.cautions}
+
+    @pytest.mark.parametrize(("sheet", "seed"), [("cloth", 1), ("paper", 0), ("paper", 10)])
+    def test_those_of_sheets_are_found_too(self, sheet: str, seed: int) -> None:
+        W, true, _ = sheet_tracks(sheet, "handheld", seed=seed)
+        found = free_cameras(*factored(W))
+        assert found.model == "shaken"
+        assert angle_between(found.rotations, true) < math.radians(8.0)
