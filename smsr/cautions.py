@@ -152,7 +152,7 @@ def camera_cautions(rotations: NDArray[np.float64], estimate: CameraEstimate) ->
             )
         )
     disagreement = estimate.criteria.get("disagreement", 0.0)
-    if estimate.model == "relaxed" and disagreement > _UNDECIDED:
+    if estimate.model in {"relaxed", "shaken"} and disagreement > _UNDECIDED:
         found.append(
             Caution(
                 "cameras-undecided",

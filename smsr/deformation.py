@@ -300,7 +300,7 @@ def log_likelihood(
 ) -> float:
     """Return the logarithm of the density of the tracks, by coordinate and but for a constant.
 
-    The density of any shapes over that of their depths given the tracks, both at the mean of these.
+    The density of the shapes of zero depth over that of no depth given the tracks.
 
     Parameters
     ----------
@@ -313,19 +313,20 @@ def log_likelihood(
     """
     frames, _, points = planar.shape
     diagonal, coupling, force = _chain(deformation, planar, axis)
-    depths = _posterior(diagonal, coupling, force).depths
-    of_depths, block = 0.0, diagonal[0]
-    for t in range(frames):
-        of_depths += float(np.linalg.slogdet(block)[1])
-        if t < frames - 1:
-            block = diagonal[t + 1] - coupling[t].T @ np.linalg.solve(block, coupling[t])
     here, ahead = deformation.temporal_precision(frames)
-    shapes = planar + axis[:, :, None] * depths[:, None]
-    deviation = shapes.reshape(frames, -1) - deformation.mean
+    deviation = planar.reshape(frames, -1) - deformation.mean
     pull = _through_time(deviation @ deformation.precision, here, ahead)
-    of_shapes = frames * float(np.linalg.slogdet(deformation.covariance)[1])
-    of_shapes += 3 * points * (frames - 1) * math.log1p(-(deformation.correlation**2))
-    total = float((deviation * pull).sum()) + of_shapes + of_depths
+    total = float((deviation * pull).sum())
+    total += frames * float(np.linalg.slogdet(deformation.covariance)[1])
+    total += 3 * points * (frames - 1) * math.log1p(-(deformation.correlation**2))
+    # Depths are eliminated one frame after the other.
+    block, right = diagonal[0], force[0]
+    for t in range(frames):
+        solved = np.linalg.solve(block, right)
+        total += float(np.linalg.slogdet(block)[1] - right @ solved)
+        if t < frames - 1:
+            right = force[t + 1] - coupling[t].T @ solved
+            block = diagonal[t + 1] - coupling[t].T @ np.linalg.solve(block, coupling[t])
     likelihood: float = -total / (4 * frames * points)
     return likelihood
 

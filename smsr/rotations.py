@@ -92,6 +92,18 @@ def mirror(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     return complete(rotations[:, :2] * flip)
 
 
+def angle_between_paths(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Return the root mean square angle of two camera paths (T, 3, 3), the object frames aligned.
+
+    Of the two mirror images of the second path the nearer one counts.
+    """
+    angles = []
+    for other in (second, mirror(second)):
+        turn = mean_rotation(first.transpose(0, 2, 1) @ other)
+        angles.append(float(np.sqrt((angles_between(first @ turn, other) ** 2).mean())))
+    return min(angles)
+
+
 SAME_SCALE = 1e-4
 """Deviation of a camera's scale from 1 that is rounding, as in a file of few digits."""
 

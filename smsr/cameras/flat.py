@@ -70,6 +70,12 @@ class FlatViews:
     tilts: NDArray[np.float64]
     determined: bool = True
 
+    @classmethod
+    def of(cls, rotations: NDArray[np.float64], axes: NDArray[np.float64]) -> FlatViews:
+        """Return how cameras (T, 3, 3) see the plane of the first two of axes (3, 3), columns."""
+        cameras = rotations[:, :2] @ axes
+        return cls(cameras[:, :, :2], cameras[:, :, 2])
+
     @property
     def cameras(self) -> NDArray[np.float64]:
         """R (T, 2, 3), of orthonormal rows."""

@@ -16,19 +16,18 @@ import numpy as np
 from smsr import rotations as so3
 from smsr.cameras.constraints import orthonormality_form
 from smsr.cameras.estimate import STILL, scaled_motion, usable_rank
-from smsr.cameras.flat import flat_views, steadier
+from smsr.cameras.flat import FlatViews, flat_views, steadier
 from smsr.cameras.likeliest import FROM_NEAR, likeliest_cameras, shaken_cameras
 from smsr.cameras.relaxed import relaxed_cameras
-from smsr.cameras.simplicity import complexity, simplest_shapes
+from smsr.cameras.rigid import part_beyond
+from smsr.cameras.simplicity import complexity
 from smsr.progress import ignore, part_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smsr.cameras.estimate import CameraEstimate
-    from smsr.cameras.flat import FlatViews
     from smsr.progress import StageHook
-    from smsr.shapes import DepthProblem
 
 RELAXATIONS = ((10, 1e-3), (3, 1e-3), (2, 1e-3), (10, 4e-3), (10, 1.6e-2))
 """Basis size and trace weight of the relaxations that are tried; mostly the first is right, with
@@ -43,7 +42,8 @@ trace makes cameras that turn little stand still, and one lighter than that whic
 still let them turn; a light one fits noise."""
 
 _TOO_NOISY = 0.1
-"""Noise, as a part of the tracks' spread, from which on simple shapes tell nothing of the trace."""
+"""Noise, as a part of the tracks' spread, from which on simple shapes tell nothing of the trace,
+and cameras of flat shapes are better left as they are."""
 
 _CERTAIN = 0.3
 """Complexity below which the first relaxation, or a lighter one, is right and no other is tried."""
@@ -66,9 +66,14 @@ must be apart, the more so where these are certain, whatever reversals there may
 reversals and much simpler."""
 
 _SIMPLE = 0.5
-"""Complexity below which a camera that shakes is no reason to look further."""
+_HARDLY_DEFORMING = 0.03
+"""Complexity, and part of the tracks that three directions leave, below which a camera that shakes
+is no reason to look further: relaxed cameras of simple shapes and nearly rigid ones are right."""
 
-_RELAXATIONS = 0.6  # part of the progress
+_FLAT = 0.1
+"""Extent of a mean shape across, as a part of its second one, below which it is flat."""
+
+_RELAXATIONS = 0.6  # part of the progress, where others may follow
 
 _FROM_THE_FRONT = math.sin(math.radians(30.0))
 """Tilt of a plane below which the tracks hardly tell which side is up."""
@@ -115,14 +120,15 @@ def free_cameras(
         shapes are so simple that the cameras are certain. Of a flat mean shape they are
         ``relaxed_complexity``, that of the best relaxation, ``width_is_determined``, 0 where it is
         as if the object had been seen from the front once, and ``frontal_views``, how often it
-        is, instead of the second. Of a camera that shakes they are ``relaxed_complexity``,
-        ``steadiness``, see `smsr.shapes.steadiness`, and ``relaxed_steadiness``; and
-        ``frontal_views``, if it sees a flat mean shape.
+        is, instead of the second. Of a camera that shakes ``disagreement`` is the angle to where
+        another start leads, if that is nearly as likely, and there are ``relaxed_complexity``,
+        ``steadiness``, see `smsr.shapes.steadiness`, ``relaxed_steadiness`` and, where the mean
+        shape is flat, ``frontal_views``.
     """
     most = max(1, len(values) // 3)
-    share = min(noise / _NOISY, 1.0) ** 2
+    heavy = min(noise / _NOISY, 1.0) ** 2
     (size, full), *rest = ((min(K, most), weight) for K, weight in RELAXATIONS)
-    weights = [max(_CLEAN_WEIGHT, full * share)]
+    weights = [max(_CLEAN_WEIGHT, full * heavy)]
     if basis_size is not None:
         size, weights, rest = basis_size, [full], []
     elif noise < _TOO_NOISY:
@@ -134,6 +140,9 @@ def free_cameras(
     measurements = left * values
     tried: list[_Relaxation] = []
 
+    plain = relaxations_only or basis_size is not None
+    share = 1.0 if plain else _RELAXATIONS
+
     def relax(K: int, weight: float) -> _Relaxation:
         count = len(ladder) + len(others)
         estimate = relaxed_cameras(
@@ -144,16 +153,11 @@ def free_cameras(
             form=form,
             max_iterations=max_iterations,
             tolerance=tolerance,
-            hook=part_of(
-                hook,
-                _RELAXATIONS * len(tried) / count,
-                _RELAXATIONS * (len(tried) + 1) / count,
-            ),
+            hook=part_of(hook, share * len(tried) / count, share * (len(tried) + 1) / count),
         )
         reason = f"relaxation with K = {K} and trace weight {weight:g}: {estimate.reason}"
         estimate = dataclasses.replace(estimate, reason=reason)
-        problem = simplest_shapes(measurements, estimate.rotations)
-        tried.append(_Relaxation(estimate, problem, problem.complexity()))
+        tried.append(_Relaxation(estimate, complexity(measurements, estimate.rotations)))
         return tried[-1]
 
     first = best = relax(*ladder[0])
@@ -171,24 +175,23 @@ def free_cameras(
         if (K, weight) == others[0] and size != K and _agree(first, other):
             break
     angles = [
-        angle_between(best.estimate.rotations, other.estimate.rotations)
+        so3.angle_between_paths(best.estimate.rotations, other.estimate.rotations)
         for other in tried
         if doubtful and other.complexity <= _AS_GOOD * best.complexity
     ]
     disagreement = math.degrees(max(angles, default=0.0))
     criteria = {"complexity": best.complexity, "disagreement": disagreement}
     found = dataclasses.replace(best.estimate, criteria=criteria)
-    if relaxations_only or basis_size is not None or best.complexity <= _NEARLY_RIGID:
+    if plain or best.complexity <= _NEARLY_RIGID:
         return found
     return _beyond_relaxations(found, best, left, values, noise, part_of(hook, _RELAXATIONS, 1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relaxation:
-    """Cameras, the simplest shapes they give, and the complexity of these."""
+    """Cameras, and the complexity of the shapes they give."""
 
     estimate: CameraEstimate
-    problem: DepthProblem
     complexity: float
 
 
@@ -203,14 +206,20 @@ def _beyond_relaxations(
     """Return the cameras of a flat mean shape, or that shake, where the relaxed ones failed."""
     measurements = left * values
     views = flat_views(left, values)
-    flat = None if views is None else _of_flat_shape(views, relaxed, measurements)
-    shaken = _of_shaken_camera(views, relaxed, measurements, noise, hook)
+    shaken = _of_shaken_camera(views, relaxed, measurements, noise, part_of(hook, 0.0, 0.8))
     if shaken is not None:
         return shaken
+    flat = None if views is None else _of_flat_shape(views, relaxed, measurements)
     if flat is None or noise >= _TOO_NOISY:
         return flat or found
-    rotations = likeliest_cameras(measurements, flat.rotations, FROM_NEAR, hook)
-    return dataclasses.replace(flat, rotations=rotations)
+    rotations = likeliest_cameras(measurements, flat.rotations, FROM_NEAR, part_of(hook, 0.8, 1.0))
+    criteria = {"complexity": complexity(measurements, rotations)}
+    return dataclasses.replace(
+        flat,
+        rotations=rotations,
+        criteria=dict(flat.criteria) | criteria,
+        reason=f"{flat.reason}; turned to where they make the tracks likeliest",
+    )
 
 
 def _of_flat_shape(
@@ -219,9 +228,7 @@ def _of_flat_shape(
     """Return the cameras of a flat mean shape where the relaxations failed on one."""
     before = relaxed.complexity
     now = complexity(measurements, views.rotations)
-    if now >= before:
-        return None
-    if _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
+    if now >= before or _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
         return None
     views = steadier(views)
     now = complexity(measurements, views.rotations)
@@ -255,32 +262,34 @@ def _of_shaken_camera(
 
     From these and those of a plane, since each may be far off.
     """
-    if relaxed.complexity < _SIMPLE:
+    deforming = part_beyond(np.linalg.norm(measurements, axis=0))
+    if relaxed.complexity < _SIMPLE or deforming < _HARDLY_DEFORMING:
         return None
     starts = [relaxed.estimate.rotations]
     if views is not None:
         starts.append(steadier(views).rotations)
-    shaken = shaken_cameras(measurements, starts, relaxed.problem, noise, hook)
+    shaken = shaken_cameras(measurements, starts, noise, hook)
     if shaken is None:
         return None
     criteria = {
-        "complexity": shaken.complexity,
+        "complexity": complexity(measurements, shaken.rotations),
         "relaxed_complexity": relaxed.complexity,
+        "disagreement": math.degrees(shaken.disagreement),
         "steadiness": shaken.steadiness,
         "relaxed_steadiness": shaken.former_steadiness,
     }
-    near = "those"
-    if views is not None and shaken.start > 0:
-        near = "those that see the object as a plane, and not near those"
-        criteria["frontal_views"] = _frontal_views(views)
+    flat = shaken.flatness < _FLAT
+    if flat:
+        criteria["frontal_views"] = _frontal_views(FlatViews.of(shaken.rotations, shaken.axes))
+    start = "those that see the object as a plane, not from those" if shaken.start > 0 else "those"
     return dataclasses.replace(
         relaxed.estimate,
         rotations=shaken.rotations,
         model="shaken",
-        flat=shaken.start > 0,
+        flat=flat,
         criteria=criteria,
         reason="the tracks shake as those of a camera that is held in the hand, and are likeliest "
-        f"for cameras near {near} of the best {relaxed.estimate.reason}",
+        f"for cameras reached from {start} of the best {relaxed.estimate.reason}",
     )
 
 
@@ -293,9 +302,9 @@ def _is_the_same(views: FlatViews, relaxed: _Relaxation, *, far_simpler: bool) -
     """Tell whether views of a plane nearly agree with relaxed cameras, which then are better."""
     cameras = relaxed.estimate.rotations
     limit = _APART if relaxed.complexity >= _CERTAIN else _APART_IF_CERTAIN
-    if angle_between(cameras, views.nearest_to(cameras).rotations) >= limit:
+    if so3.angle_between_paths(cameras, views.nearest_to(cameras).rotations) >= limit:
         return False
-    return not far_simpler or angle_between(cameras, views.rotations) < _FAR_APART
+    return not far_simpler or so3.angle_between_paths(cameras, views.rotations) < _FAR_APART
 
 
 def _agree(first: _Relaxation, second: _Relaxation) -> bool:
@@ -305,22 +314,10 @@ def _agree(first: _Relaxation, second: _Relaxation) -> bool:
     """
     if first.complexity >= _CREDIBLE or second.complexity < _CLEARLY_LOWER * first.complexity:
         return False
-    return angle_between(first.estimate.rotations, second.estimate.rotations) < _AGREEMENT
+    return so3.angle_between_paths(first.estimate.rotations, second.estimate.rotations) < _AGREEMENT
 
 
 def _is_clearly_simpler(other: _Relaxation, first: _Relaxation) -> bool:
     """Tell whether a relaxation gives so much simpler shapes that the first has failed."""
     clear = other.complexity < _CLEARLY_LOWER * first.complexity
     return clear and (other.complexity < _CREDIBLE or first.complexity > 1.0)
-
-
-def angle_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Return the root mean square angle of two camera paths (T, 3, 3), the object frames aligned.
-
-    Of the two mirror images of the second path the nearer one counts.
-    """
-    angles = []
-    for other in (second, so3.mirror(second)):
-        turn = so3.mean_rotation(first.transpose(0, 2, 1) @ other)
-        angles.append(float(np.sqrt((so3.angles_between(first @ turn, other) ** 2).mean())))
-    return min(angles)

@@ -4,8 +4,9 @@ The simplest shapes do not tell of a camera that turns by some degrees only, and
 they lead it astray. If it shakes, as one that is held in the hand, the tracks tell all the same: no
 object moves to and fro from frame to frame as its image does then. The Gaussian model of the
 deformation (`smsr.deformation`), in which consecutive shapes are alike, puts a number on it, and
-the cameras follow its gradient together with the depths. A camera that turns slowly must not be
-left to it: what the object does as slowly is then as likely the camera's.
+the cameras follow its gradient together with the depths. Relaxed cameras that turn slowly must not
+be left to it: what the object does as slowly is then as likely the camera's. Those of a flat mean
+shape may, for they are off by what the object bends.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from scipy.linalg import solveh_banded
 
 from smsr import rotations as so3
 from smsr.cameras.estimate import STILL
-from smsr.cameras.simplicity import roughly_solved, simplest_shapes, steadiness_of
+from smsr.cameras.simplicity import DIRECTIONS, roughly_solved
 from smsr.deformation import (
     as_seen,
     condition,
@@ -31,6 +32,7 @@ from smsr.deformation import (
     turning_force,
 )
 from smsr.progress import ignore, part_of
+from smsr.shapes import steadiness
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +41,6 @@ if TYPE_CHECKING:
 
     from smsr.deformation import Deformation
     from smsr.progress import StageHook
-    from smsr.shapes import DepthProblem
 
 FROM_FAR = ((0.03, 100), (0.01, 30), (0.005, 20), (0.0025, 20))
 """Floors of the model, and rounds with each, that lead from cameras which may be off by tens of
@@ -48,17 +49,20 @@ degrees: a high one lets them go far, a low one tells small errors."""
 FROM_NEAR = ((0.01, 40), (0.005, 20), (0.0025, 20))
 """The same from cameras that are nearly right."""
 
-_DIRECTIONS = 18
+_FRAMES_IN_ALL_ROUNDS = 1000
+_FEWEST_ROUNDS = 10
 _ROUNDS_WITHOUT_TURNS = 5  # until the model has left the shapes that it was learnt from first
 _LONGEST_STEP = math.radians(3.0)
 _LEAST_CURVATURE = 1e-3  # of the mean one
 
+_JUDGED_FRAMES = 200
 _JUDGING_FLOOR, _JUDGING_ROUNDS, _JUDGING_TOLERANCE = 0.01, 15, 5e-4
 _ROUGH = 0.35  # second over first differences of the tracks, squared
 _SLOWLY = 0.9  # correlation of consecutive shapes
 _STEADY = 0.6  # steadiness of shapes from which on their cameras need no help
 _STEADIER = 0.05
-_CREDIBLE, _CREDIBLE_BY_NOISE = 0.15, 1.5  # steadiness below which likelier cameras are none
+_AS_LIKELY = 0.05  # log-likelihood by coordinate
+_CREDIBLE, _CREDIBLE_BY_NOISE = 0.22, 0.5  # steadiness below which likelier cameras are none
 
 
 def likeliest_cameras(
@@ -80,7 +84,8 @@ def likeliest_cameras(
     rotations : ndarray of shape (T, 3, 3)
         Cameras to start from, completed by the viewing direction.
     stages : sequence of pairs
-        Floor of the model, see `smsr.deformation.likely_shapes`, and number of rounds.
+        Floor of the model, see `smsr.deformation.likely_shapes`, and number of rounds, which is
+        reduced for more than 1000 frames.
     hook : callable
         See `smsr.progress.StageHook`.
 
@@ -88,10 +93,12 @@ def likeliest_cameras(
     -------
     ndarray of shape (T, 3, 3)
     """
-    some = np.ascontiguousarray(measurements[:, :_DIRECTIONS])
+    some = np.ascontiguousarray(measurements[:, :DIRECTIONS])
     seen = some.reshape(len(rotations), 2, -1)
-    count, done = sum(rounds for _, rounds in stages), 0
-    for floor, rounds in stages:
+    part = min(1.0, _FRAMES_IN_ALL_ROUNDS / len(rotations))
+    schedule = [(floor, max(min(r, _FEWEST_ROUNDS), round(part * r))) for floor, r in stages]
+    count, done = sum(rounds for _, rounds in schedule), 0
+    for floor, rounds in schedule:
         problem = roughly_solved(some, np.ascontiguousarray(rotations))
         shapes = problem.shapes.reshape(len(rotations), 3, -1)
         axis, planar = as_seen(rotations, seen)
@@ -99,7 +106,7 @@ def likeliest_cameras(
         model = first_model(shapes, axis, variance)
         for iteration in range(1, rounds + 1):
             posterior = condition(model, planar, axis)
-            longest = 0.0
+            longest = None
             if iteration > _ROUNDS_WITHOUT_TURNS:
                 shapes = planar + axis[:, :, None] * posterior.depths[:, None]
                 force = turning_force(model, planar, rotations, posterior)
@@ -123,8 +130,8 @@ def _newton_step(
 ) -> NDArray[np.float64]:
     """Return the turns (T, 3) of the cameras that the gradient (T, 3) leads to.
 
-    The curvature is that of the log-density of the shapes with their depths held, which is more
-    than that of the tracks alone: steps are short rather than long.
+    The curvature is that of the log-density of the shapes with their depths held at the mean. Free
+    depths would make it less, so steps are short rather than long.
     """
     frames, _, points = shapes.shape
     seen = rotations @ shapes
@@ -157,8 +164,12 @@ class ShakenCameras:
         Completed by the viewing direction.
     start : int
         Which of the cameras to start from led there.
-    complexity : float
-        Of their shapes, see `smsr.cameras.simplicity`.
+    disagreement : float
+        Largest root mean square angle to where the others led, if that is nearly as likely.
+    axes : ndarray of shape (3, 3)
+        Principal axes of the mean shape as columns, the longest first.
+    flatness : float
+        Extent of the mean shape along the last of them, as a part of that along the second.
     steadiness : float
         Of their shapes, see `smsr.shapes.steadiness`,
     former_steadiness : float
@@ -167,7 +178,9 @@ class ShakenCameras:
 
     rotations: NDArray[np.float64]
     start: int
-    complexity: float
+    disagreement: float
+    axes: NDArray[np.float64]
+    flatness: float
     steadiness: float
     former_steadiness: float
 
@@ -175,7 +188,6 @@ class ShakenCameras:
 def shaken_cameras(
     measurements: NDArray[np.float64],
     starts: Sequence[NDArray[np.float64]],
-    problem: DepthProblem,
     noise: float = 0.0,
     hook: StageHook = ignore,
 ) -> ShakenCameras | None:
@@ -186,9 +198,7 @@ def shaken_cameras(
     measurements : ndarray of shape (2T, q)
         Virtual points, strongest first.
     starts : sequence of ndarray of shape (T, 3, 3)
-        Cameras to start from, one at least.
-    problem : DepthProblem
-        Of the simplest shapes for the first ones, see `smsr.cameras.simplicity`.
+        Cameras to start from, one at least. The first ones are judged.
     noise : float
         As a part of the tracks' spread: what is left of it shakes the tracks, too.
     hook : callable
@@ -203,22 +213,34 @@ def shaken_cameras(
     """
     if not _are_rough(measurements, len(starts[0])):
         return None
-    before = steadiness_of(problem)
-    if before >= _STEADY or _Judged.of(problem).correlation < _SLOWLY:
+    before = _Judged.of(measurements, starts[0])
+    if before.steadiness >= _STEADY or before.correlation < _SLOWLY:
         return None
     found = []
     for i, start in enumerate(starts):
         part = part_of(hook, i / len(starts), (i + 1) / len(starts))
         rotations = likeliest_cameras(measurements, start, FROM_FAR, part)
-        found.append((_Judged.of(simplest_shapes(measurements, rotations)), i, rotations))
+        found.append((_Judged.of(measurements, rotations), i, rotations))
     best, which, rotations = max(found, key=lambda one: one[0].log_likelihood)
-    credible = _CREDIBLE + _CREDIBLE_BY_NOISE * noise
     if so3.spread_of_views(rotations) < STILL:
         return None
-    steadiness = steadiness_of(best.problem)
-    if steadiness < max(before + _STEADIER, credible):
+    credible = _CREDIBLE + _CREDIBLE_BY_NOISE * noise
+    if best.steadiness < max(before.steadiness + _STEADIER, credible):
         return None
-    return ShakenCameras(rotations, which, best.problem.complexity(), steadiness, before)
+    axes, extents, _ = np.linalg.svd(best.shapes.mean(axis=0))
+    return ShakenCameras(
+        rotations=rotations,
+        start=which,
+        disagreement=max(
+            so3.angle_between_paths(rotations, other)
+            for judged, _, other in found
+            if judged.log_likelihood > best.log_likelihood - _AS_LIKELY
+        ),
+        axes=axes,
+        flatness=float(extents[2:].sum() / max(extents[1], np.finfo(float).tiny)),
+        steadiness=best.steadiness,
+        former_steadiness=before.steadiness,
+    )
 
 
 def _are_rough(measurements: NDArray[np.float64], frames: int) -> bool:
@@ -230,21 +252,31 @@ def _are_rough(measurements: NDArray[np.float64], frames: int) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
-    """What a model of the deformation, learnt from the simplest shapes, says of their cameras."""
+    """Simplest shapes of some cameras in a row, and what the model learnt from them says."""
 
-    problem: DepthProblem
+    shapes: NDArray[np.float64]
+    steadiness: float
     correlation: float
     log_likelihood: float
 
     @classmethod
-    def of(cls, problem: DepthProblem) -> _Judged:
-        shapes = problem.shapes.reshape(problem.frames, 3, -1)
+    def of(cls, measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> _Judged:
+        first = max(0, (len(rotations) - _JUDGED_FRAMES) // 2)
+        rotations = np.ascontiguousarray(rotations[first : first + _JUDGED_FRAMES])
+        seen = measurements[2 * first :][: 2 * len(rotations), :DIRECTIONS]
+        problem = roughly_solved(np.ascontiguousarray(seen), rotations)
+        shapes = problem.shapes.reshape(len(rotations), 3, -1)
         model = likely_shapes(
             shapes,
-            problem.rotations,
+            rotations,
             floor=_JUDGING_FLOOR,
             max_iterations=_JUDGING_ROUNDS,
             tolerance=_JUDGING_TOLERANCE,
         ).deformation
-        axis, planar = as_seen(problem.rotations, problem.rotations[:, :2] @ shapes)
-        return cls(problem, model.correlation, log_likelihood(model, planar, axis))
+        axis, planar = as_seen(rotations, rotations[:, :2] @ shapes)
+        return cls(
+            shapes,
+            steadiness(shapes, rotations),
+            model.correlation,
+            log_likelihood(model, planar, axis),
+        )

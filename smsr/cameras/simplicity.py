@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smsr.shapes import DepthProblem, steadiness
+from smsr.shapes import DepthProblem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+DIRECTIONS = 18
+"""Virtual points that cameras are judged by."""
+
 _FRAMES = 200
-_DIRECTIONS = 18
 
 
 def complexity(measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> float:
@@ -29,17 +31,9 @@ def complexity(measurements: NDArray[np.float64], rotations: NDArray[np.float64]
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     """
-    return simplest_shapes(measurements, rotations).complexity()
-
-
-def simplest_shapes(
-    measurements: NDArray[np.float64], rotations: NDArray[np.float64]
-) -> DepthProblem:
-    """Return the problem of the best shapes, solved roughly on some frames and directions."""
     step = math.ceil(len(rotations) / _FRAMES)
-    return roughly_solved(
-        every_frame(measurements, step)[:, :_DIRECTIONS], np.ascontiguousarray(rotations[::step])
-    )
+    some = every_frame(measurements, step)[:, :DIRECTIONS]
+    return roughly_solved(some, np.ascontiguousarray(rotations[::step])).complexity()
 
 
 def roughly_solved(
@@ -49,11 +43,6 @@ def roughly_solved(
     problem = DepthProblem(measurements, rotations)
     problem.minimise(60, 3e-4)
     return problem
-
-
-def steadiness_of(problem: DepthProblem) -> float:
-    """Return what the steadiness of the best shapes says for their cameras."""
-    return steadiness(problem.shapes.reshape(problem.frames, 3, -1), problem.rotations)
 
 
 def every_frame(measurements: NDArray[np.float64], step: int) -> NDArray[np.float64]:

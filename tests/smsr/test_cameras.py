@@ -20,7 +20,7 @@ from smsr.cameras.constraints import (
 )
 from smsr.cameras.estimate import CameraEstimate, scaled_motion, usable_rank
 from smsr.cameras.flat import FEWEST_FRAMES, FlatViews, flat_views, smoothest_signs, steadier
-from smsr.cameras.free import angle_between, free_cameras
+from smsr.cameras.free import free_cameras
 from smsr.cameras.gauge import fix_gauge
 from smsr.cameras.gimbal import fit_gimbal
 from smsr.cameras.paces import fit_paces
@@ -300,9 +300,9 @@ class TestFree:
         G = swing()
         turn = Rotation.random(random_state=1).as_matrix()
         for same in (G @ turn, so3.mirror(G) @ turn):
-            assert angle_between(G, same) == pytest.approx(0.0, abs=1e-6)
+            assert so3.angle_between_paths(G, same) == pytest.approx(0.0, abs=1e-6)
         trembling = so3.exp(0.1 * np.random.default_rng(0).standard_normal((60, 3))) @ G
-        assert angle_between(G, trembling) == pytest.approx(0.1 * np.sqrt(3.0), rel=0.2)
+        assert so3.angle_between_paths(G, trembling) == pytest.approx(0.1 * np.sqrt(3.0), rel=0.2)
 
 
 def factored(W: Array) -> tuple[Array, Array]:
@@ -345,9 +345,9 @@ class TestFlat:
         views = flat_views(left, values)
         assert views is not None
         assert_cameras(views.rotations)
-        assert angle_between(views.rotations, true) < 0.001 + 0.6 * bend
+        assert so3.angle_between_paths(views.rotations, true) < 0.001 + 0.6 * bend
         # A rigid or relaxed upgrade takes the bending for depth.
-        assert angle_between(relaxed_cameras(left, values).rotations, true) > 0.4
+        assert so3.angle_between_paths(relaxed_cameras(left, values).rotations, true) > 0.4
 
     @pytest.mark.parametrize("turn", [orbit(90, 3.0), swing(90)])
     def test_whoever_turns_the_image_or_mirrors_it_gets_the_same(self, turn: Array) -> None:
@@ -387,7 +387,9 @@ class TestFlat:
         spoilt = views.reversed_from(frontal[0]).reversed_from(frontal[1])
         assert np.abs(spoilt.tilts - views.tilts).max() > 0.5
         mended = steadier(spoilt)
-        assert angle_between(mended.rotations, views.rotations) == pytest.approx(0.0, abs=1e-6)
+        assert so3.angle_between_paths(mended.rotations, views.rotations) == pytest.approx(
+            0.0, abs=1e-6
+        )
 
     def test_a_view_from_the_front_counts_once_however_long_it_lasts(self) -> None:
         views = tilted()
@@ -397,7 +399,7 @@ class TestFlat:
         held = FlatViews(views.rows.repeat(times, axis=0), views.tilts.repeat(times, axis=0))
         assert len(held.frontal_frames()) == len(frontal)
         spoilt = held.reversed_from(sorted(held.frontal_frames())[0])
-        assert angle_between(spoilt.rotations, held.rotations) > 0.5
+        assert so3.angle_between_paths(spoilt.rotations, held.rotations) > 0.5
         shaken = views.tilts + 0.01 * np.random.default_rng(0).standard_normal(views.tilts.shape)
         assert len(FlatViews(views.rows, shaken).frontal_frames(0.5)) == len(frontal)
 
@@ -434,8 +436,8 @@ class TestFlat:
         assert found.criteria["complexity"] < 0.8 * found.criteria["relaxed_complexity"]
         relaxed = free_cameras(left, values, relaxations_only=True)
         assert (relaxed.model, relaxed.flat) == ("relaxed", False)
-        off = angle_between(relaxed.rotations, true)
-        assert angle_between(found.rotations, true) < 0.8 * off
+        off = so3.angle_between_paths(relaxed.rotations, true)
+        assert so3.angle_between_paths(found.rotations, true) < 0.8 * off
 
     def test_other_shapes_are_not(self) -> None:
         W, _, _ = shaken()
@@ -797,7 +799,9 @@ class TestSelection:
         assert estimate.criteria["unrest"] < 0.16
         assert estimate.simpler is free.rotations
         assert estimate.simpler_share == 1.0
-        assert angle_between(estimate.rotations, true) < 0.4 * angle_between(free.rotations, true)
+        assert so3.angle_between_paths(estimate.rotations, true) < 0.4 * so3.angle_between_paths(
+            free.rotations, true
+        )
 
     def test_it_can_be_forced(self) -> None:
         left, values = low_rank(swing(20))
