@@ -55,14 +55,14 @@ _ROUNDS_WITHOUT_TURNS = 5  # until the model has left the shapes that it was lea
 _LONGEST_STEP = math.radians(3.0)
 _LEAST_CURVATURE = 1e-3  # of the mean one
 
-_JUDGED_FRAMES = 200
+_JUDGED_FRAMES = 400
 _JUDGING_FLOOR, _JUDGING_ROUNDS, _JUDGING_TOLERANCE = 0.01, 15, 5e-4
 _ROUGH = 0.35  # second over first differences of the tracks, squared
 _SLOWLY = 0.9  # correlation of consecutive shapes
-_STEADY = 0.6  # steadiness of shapes from which on their cameras need no help
+_STEADY = 0.7  # steadiness of shapes from which on their cameras need no help
 _STEADIER = 0.05
 _AS_LIKELY = 0.05  # log-likelihood by coordinate
-_CREDIBLE, _CREDIBLE_BY_NOISE = 0.22, 0.5  # steadiness below which likelier cameras are none
+_CREDIBLE, _CREDIBLE_BY_NOISE = 0.15, 1.0  # steadiness below which likelier cameras are none
 
 
 def likeliest_cameras(
