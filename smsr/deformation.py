@@ -290,9 +290,14 @@ def _chain(
     blocks = _by_axes(precision, points)
     diagonal = (_outer(axis, axis) * here[:, None] @ blocks).reshape(frames, points, points)
     coupling = (ahead * _outer(axis[:-1], axis[1:]) @ blocks).reshape(-1, points, points)
-    pull = (planar.reshape(frames, -1) - deformation.mean) @ precision
-    pull = _through_time(pull, here, ahead).reshape(frames, 3, points)
-    return diagonal, coupling, -depths_along(axis, pull)
+    return diagonal, coupling, -depths_along(axis, _pull(deformation, planar))
+
+
+def _pull(deformation: Deformation, shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the gradient of the log-density of shapes (T, 3, q), negated."""
+    here, ahead = deformation.temporal_precision(len(shapes))
+    rows = (shapes.reshape(len(shapes), -1) - deformation.mean) @ deformation.precision
+    return _through_time(rows, here, ahead).reshape(shapes.shape)
 
 
 def log_likelihood(
@@ -313,10 +318,8 @@ def log_likelihood(
     """
     frames, _, points = planar.shape
     diagonal, coupling, force = _chain(deformation, planar, axis)
-    here, ahead = deformation.temporal_precision(frames)
     deviation = planar.reshape(frames, -1) - deformation.mean
-    pull = _through_time(deviation @ deformation.precision, here, ahead)
-    total = float((deviation * pull).sum())
+    total = float((deviation * _pull(deformation, planar).reshape(frames, -1)).sum())
     total += frames * float(np.linalg.slogdet(deformation.covariance)[1])
     total += 3 * points * (frames - 1) * math.log1p(-(deformation.correlation**2))
     # Depths are eliminated one frame after the other.
@@ -428,9 +431,7 @@ def turning_force(
     here, ahead = deformation.temporal_precision(frames)
     precision = deformation.precision
     shapes = planar + axis[:, :, None] * posterior.depths[:, None]
-    pull = _through_time(
-        (shapes.reshape(frames, -1) - deformation.mean) @ precision, here, ahead
-    ).reshape(frames, 3, points)
+    pull = _pull(deformation, shapes)
     force: NDArray[np.float64] = np.cross(rotations @ shapes, rotations @ pull, axis=1).sum(axis=2)
     # The depths and the pull on them vary together.
     blocks = _by_axes(precision, points).T

@@ -44,7 +44,7 @@ class CameraEstimate:
         Numbers that the choice was based on, see `smsr.cameras.free` and
         `smsr.cameras.selection`.
     flat : bool
-        Whether they come, or started, from a flat mean shape, see `smsr.cameras.flat`.
+        Whether the mean shape is flat, see `smsr.cameras.flat`.
     coherent : bool
         Whether a simple path of the camera made the object move no more.
     simpler : ndarray of shape (T, 3, 3), optional
