@@ -45,7 +45,7 @@ def exp(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def log(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation vectors (T, 3), of angle at most pi, of rotations (T, 3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())
+    return np.asarray(Rotation.from_matrix(rotations, assume_valid=True).as_rotvec())
 
 
 def left_jacobian(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -79,7 +79,8 @@ def mean_rotation(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def angles_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the angles (T,), radians, between rotations (T, 3, 3)."""
-    return np.asarray(Rotation.from_matrix(first @ second.transpose(0, 2, 1)).magnitude())
+    turns = first @ second.transpose(0, 2, 1)
+    return np.asarray(Rotation.from_matrix(turns, assume_valid=True).magnitude())
 
 
 def mirror(rotations: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -265,10 +265,11 @@ def _of_shaken_camera(
     deforming = part_beyond(np.linalg.norm(measurements, axis=0))
     if relaxed.complexity < _SIMPLE or deforming < _HARDLY_DEFORMING:
         return None
-    starts = [relaxed.estimate.rotations]
-    if views is not None:
-        starts.append(steadier(views).rotations)
-    shaken = shaken_cameras(measurements, starts, noise, hook)
+
+    def of_plane() -> list[NDArray[np.float64]]:
+        return [] if views is None else [steadier(views).rotations]
+
+    shaken = shaken_cameras(measurements, relaxed.estimate.rotations, of_plane, noise, hook)
     if shaken is None:
         return None
     criteria = {

@@ -35,7 +35,7 @@ from smsr.progress import ignore, part_of
 from smsr.shapes import steadiness
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -163,7 +163,7 @@ class ShakenCameras:
     rotations : ndarray of shape (T, 3, 3)
         Completed by the viewing direction.
     start : int
-        Which of the cameras to start from led there.
+        Which of the cameras to start from led there, 0 the judged ones.
     disagreement : float
         Largest root mean square angle to where the others led, if that is nearly as likely.
     axes : ndarray of shape (3, 3)
@@ -173,7 +173,7 @@ class ShakenCameras:
     steadiness : float
         Of their shapes, see `smsr.shapes.steadiness`,
     former_steadiness : float
-        and of those of the first cameras to start from.
+        and of those of the cameras that were judged.
     """
 
     rotations: NDArray[np.float64]
@@ -187,7 +187,8 @@ class ShakenCameras:
 
 def shaken_cameras(
     measurements: NDArray[np.float64],
-    starts: Sequence[NDArray[np.float64]],
+    rotations: NDArray[np.float64],
+    more: Callable[[], Sequence[NDArray[np.float64]]] = tuple,
     noise: float = 0.0,
     hook: StageHook = ignore,
 ) -> ShakenCameras | None:
@@ -197,8 +198,10 @@ def shaken_cameras(
     ----------
     measurements : ndarray of shape (2T, q)
         Virtual points, strongest first.
-    starts : sequence of ndarray of shape (T, 3, 3)
-        Cameras to start from, one at least. The first ones are judged.
+    rotations : ndarray of shape (T, 3, 3)
+        Cameras to judge and to start from.
+    more : callable
+        Returns further cameras to start from; called only where there is a reason to start.
     noise : float
         As a part of the tracks' spread: what is left of it shakes the tracks, too.
     hook : callable
@@ -208,15 +211,15 @@ def shaken_cameras(
     -------
     ShakenCameras or None
         None where the tracks are smooth, the object is as hasty as the camera, the shapes of the
-        first cameras are steady already, or the likeliest ones stand still or give no steadier
+        given cameras are steady already, or the likeliest ones stand still or give no steadier
         shapes.
     """
-    if not _are_rough(measurements, len(starts[0])):
+    if not _are_rough(measurements, len(rotations)):
         return None
-    before = _Judged.of(measurements, starts[0])
+    before = _Judged.of(measurements, rotations)
     if before.steadiness >= _STEADY or before.correlation < _SLOWLY:
         return None
-    found = []
+    starts, found = [rotations, *more()], []
     for i, start in enumerate(starts):
         part = part_of(hook, i / len(starts), (i + 1) / len(starts))
         rotations = likeliest_cameras(measurements, start, FROM_FAR, part)

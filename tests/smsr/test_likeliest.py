@@ -106,9 +106,9 @@ class TestLikeliest:
 
 
 def of_shaken(
-    measurements: Array, *starts: Array, noise: float = 0.0, hook: StageHook = ignore
+    measurements: Array, first: Array, *more: Array, noise: float = 0.0, hook: StageHook = ignore
 ) -> ShakenCameras | None:
-    return shaken_cameras(measurements, starts, noise, hook)
+    return shaken_cameras(measurements, first, lambda: more, noise, hook)
 
 
 def forbidden(fraction: float, iteration: int, residual: float | None) -> None:
