@@ -33,6 +33,7 @@ from smsr.cameras.simplicity import complexity
 from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
 from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
+from tests.factored import factored
 from tests.shaken import shaken
 
 if TYPE_CHECKING:
@@ -303,12 +304,6 @@ class TestFree:
             assert so3.angle_between_paths(G, same) == pytest.approx(0.0, abs=1e-6)
         trembling = so3.exp(0.1 * np.random.default_rng(0).standard_normal((60, 3))) @ G
         assert so3.angle_between_paths(G, trembling) == pytest.approx(0.1 * np.sqrt(3.0), rel=0.2)
-
-
-def factored(W: Array) -> tuple[Array, Array]:
-    """Return left singular vectors and singular values of tracks, the largest 1."""
-    left, values, _ = np.linalg.svd(W - W.mean(axis=1, keepdims=True), full_matrices=False)
-    return left[:, :30], values[:30] / values[0]
 
 
 def board(rotations: Array, bend: float = 0.0, seed: int = 0) -> Array:

@@ -15,6 +15,7 @@ from smsr.cameras.likeliest import FROM_FAR, FROM_NEAR, likeliest_cameras, shake
 from smsr.errors import Cancelled
 from smsr.pipeline import reconstruct
 from smsr.progress import ignore
+from tests.factored import factored
 from tests.shaken import shaken
 
 if TYPE_CHECKING:
@@ -24,13 +25,6 @@ if TYPE_CHECKING:
     from smsr.progress import StageHook
 
     Array = NDArray[np.float64]
-
-
-def factored(W: Array, count: int = 18) -> tuple[Array, Array]:
-    """Return left singular vectors and singular values of tracks, the largest 1."""
-    left, values, _ = np.linalg.svd(W - W.mean(axis=1, keepdims=True), full_matrices=False)
-    count = min(count, int((values > 1e-9 * values[0]).sum()))
-    return left[:, :count], values[:count] / values[0]
 
 
 def tracks(frames: int = 120, seed: int = 0) -> tuple[Array, Array]:
