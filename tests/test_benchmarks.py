@@ -58,6 +58,19 @@ def test_camera_paths(tmp_path: Path, evaluation_data: Path) -> None:
 
 
 @pytest.mark.data
+def test_held_out(tmp_path: Path, evaluation_data: Path) -> None:
+    report = tmp_path / "members.json"
+    few = ("--first", "3", "--count", "2", "--processes", "1", "--json", str(report))
+    rows = run("held_out.py", "--data", str(evaluation_data), *few)
+    members = json.loads(report.read_text())
+    total = next(row for row in rows if row[:3] == ["|", "all", "|"])
+    assert total[3] == "2"
+    ratios = [one["default"]["object"] / one["baseline"]["object"] for one in members]
+    assert float(total[5]) == pytest.approx((ratios[0] * ratios[1]) ** 0.5, abs=0.006)
+    assert members[0]["shape"] != members[1]["shape"]
+
+
+@pytest.mark.data
 def test_missing_data(tmp_path: Path, evaluation_data: Path) -> None:
     out = tmp_path / "missing.json"
     cases = ("all seen", "30% at random", "5% errors, reject")
