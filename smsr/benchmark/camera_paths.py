@@ -401,7 +401,7 @@ def lost(members: Iterable[Member]) -> list[Member]:
 def lost_lines(members: Iterable[Member]) -> list[str]:
     """Say of each lost member how much it lost."""
     return [
-        f"{one.shape}, {one.path}, {one.noise:.0%} noise: {one.ratios[0]:.2f} in the object "
+        f"{one.shape}, {one.path}, {100 * one.noise:g}% noise: {one.ratios[0]:.2f} in the object "
         f"frame, {one.ratios[1]:.2f} in the camera frame"
         for one in lost(members)
     ]

@@ -20,7 +20,7 @@ from smsr.cameras.flat import FlatViews, flat_views, steadier
 from smsr.cameras.likeliest import FROM_NEAR, likeliest_cameras, shaken_cameras
 from smsr.cameras.relaxed import relaxed_cameras
 from smsr.cameras.rigid import part_beyond
-from smsr.cameras.simplicity import complexity
+from smsr.cameras.simplicity import complexity, flatness, on_some_frames
 from smsr.progress import ignore, part_of
 
 if TYPE_CHECKING:
@@ -63,14 +63,14 @@ _APART, _APART_IF_CERTAIN, _FAR_APART = np.radians([15.0, 20.0, 20.0]).tolist()
 """Cameras of a flat mean shape are taken where their shapes are simple, and clearly simpler than
 those of the relaxations. Where the two nearly agree, the relaxed ones are more accurate. So they
 must be apart, the more so where these are certain, whatever reversals there may be; or far apart by
-reversals and much simpler."""
+reversals and much simpler. Much simpler, too, where the mean shape turns out not to be so flat."""
 
 _SIMPLE = 0.5
 _HARDLY_DEFORMING = 0.03
 """Complexity, and part of the tracks that three directions leave, below which a camera that shakes
 is no reason to look further: relaxed cameras of simple shapes and nearly rigid ones are right."""
 
-_FLAT = 0.1
+_FLAT = 0.15
 """Extent of a mean shape across, as a part of its second one, below which it is flat."""
 
 _RELAXATIONS = 0.6  # part of the progress, where others may follow
@@ -231,8 +231,10 @@ def _of_flat_shape(
     if now >= before or _is_the_same(views, relaxed, far_simpler=now < _FAR_SIMPLER * before):
         return None
     views = steadier(views)
-    now = complexity(measurements, views.rotations)
-    if now >= _CLEARLY_SIMPLER * before or (now >= _CREDIBLE_FLAT and before <= 1.0):
+    problem = on_some_frames(measurements, views.rotations)
+    now, flat = problem.complexity(), flatness(problem.shapes.reshape(problem.frames, 3, -1))
+    clearly = _CLEARLY_SIMPLER if flat < _FLAT else _FAR_SIMPLER
+    if now >= clearly * before or (now >= _CREDIBLE_FLAT and before <= 1.0):
         return None
     return dataclasses.replace(
         relaxed.estimate,

@@ -20,7 +20,7 @@ from scipy.linalg import solveh_banded
 
 from smsr import rotations as so3
 from smsr.cameras.estimate import STILL
-from smsr.cameras.simplicity import DIRECTIONS, roughly_solved
+from smsr.cameras.simplicity import DIRECTIONS, flatness, roughly_solved
 from smsr.deformation import (
     as_seen,
     condition,
@@ -169,7 +169,7 @@ class ShakenCameras:
     axes : ndarray of shape (3, 3)
         Principal axes of the mean shape as columns, the longest first.
     flatness : float
-        Extent of the mean shape along the last of them, as a part of that along the second.
+        Of the mean shape, see `smsr.cameras.simplicity.flatness`.
     steadiness : float
         Of their shapes, see `smsr.shapes.steadiness`,
     former_steadiness : float
@@ -230,7 +230,6 @@ def shaken_cameras(
     credible = _CREDIBLE + _CREDIBLE_BY_NOISE * noise
     if best.steadiness < max(before.steadiness + _STEADIER, credible):
         return None
-    axes, extents, _ = np.linalg.svd(best.shapes.mean(axis=0))
     return ShakenCameras(
         rotations=rotations,
         start=which,
@@ -239,8 +238,8 @@ def shaken_cameras(
             for judged, _, other in found
             if judged.log_likelihood > best.log_likelihood - _AS_LIKELY
         ),
-        axes=axes,
-        flatness=float(extents[2:].sum() / max(extents[1], np.finfo(float).tiny)),
+        axes=np.linalg.svd(best.shapes.mean(axis=0))[0],
+        flatness=flatness(best.shapes),
         steadiness=best.steadiness,
         former_steadiness=before.steadiness,
     )

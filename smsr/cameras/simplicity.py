@@ -31,9 +31,22 @@ def complexity(measurements: NDArray[np.float64], rotations: NDArray[np.float64]
     rotations : ndarray of shape (T, 3, 3)
         Cameras completed by the viewing direction.
     """
+    return on_some_frames(measurements, rotations).complexity()
+
+
+def on_some_frames(
+    measurements: NDArray[np.float64], rotations: NDArray[np.float64]
+) -> DepthProblem:
+    """Return the problem that `complexity` is taken of, solved; parameters as there."""
     step = math.ceil(len(rotations) / _FRAMES)
     some = every_frame(measurements, step)[:, :DIRECTIONS]
-    return roughly_solved(some, np.ascontiguousarray(rotations[::step])).complexity()
+    return roughly_solved(some, np.ascontiguousarray(rotations[::step]))
+
+
+def flatness(shapes: NDArray[np.float64]) -> float:
+    """Return the extent of the mean of shapes (T, 3, q) across, as a part of its second one."""
+    extents = np.linalg.svd(shapes.mean(axis=0), compute_uv=False)
+    return float(extents[2:].sum() / max(extents[1], np.finfo(float).tiny))
 
 
 def roughly_solved(

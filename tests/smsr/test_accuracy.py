@@ -9,6 +9,7 @@ import pytest
 import scipy.io
 
 from smsr import evaluate, reconstruct
+from smsr.benchmark.camera_paths import PATHS, errors, sway, true_shapes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -77,3 +78,18 @@ def test_published_method(evaluation_data: Path, name: str, bar: float) -> None:
     frame = "camera" if name == "dance" else "object"
     result = reconstruct(W, preset="paper")
     assert evaluate(truth, result, frame=frame).e3d <= bar  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("path", "noise"), [("slow", 0.005), ("eased", 0.02)])
+def test_a_slab_is_not_taken_for_a_sheet(evaluation_data: Path, path: str, noise: float) -> None:
+    """The dinosaur is three times as wide as deep."""
+    true = true_shapes(evaluation_data, "dinosaur")
+    rng = np.random.default_rng(1)
+    time = 1.5 * np.arange(len(true), dtype=np.float64)
+    rotations = PATHS[path](time, rng) @ sway(np.array([-20.0]), 10.0)
+    W = (rotations[:, :2] @ true).reshape(2 * len(true), -1)
+    W += noise * np.abs(W).max() * rng.standard_normal(W.shape)
+    result = reconstruct(W)
+    assert result.diagnostics.camera_model != "flat"
+    found = errors(result.cameras, result.shapes.transpose(0, 2, 1), rotations, true)
+    assert found.camera < 0.2
