@@ -63,7 +63,8 @@ _APART, _APART_IF_CERTAIN, _FAR_APART = np.radians([15.0, 20.0, 20.0]).tolist()
 """Cameras of a flat mean shape are taken where their shapes are simple, and clearly simpler than
 those of the relaxations. Where the two nearly agree, the relaxed ones are more accurate. So they
 must be apart, the more so where these are certain, whatever reversals there may be; or far apart by
-reversals and much simpler. Much simpler, too, where the mean shape turns out not to be so flat."""
+reversals and much simpler. Much simpler, too, where the mean shape turns out not to be so flat,
+unless noise is what makes it thick."""
 
 _SIMPLE = 0.5
 _HARDLY_DEFORMING = 0.03
@@ -209,7 +210,7 @@ def _beyond_relaxations(
     shaken = _of_shaken_camera(views, relaxed, measurements, noise, part_of(hook, 0.0, 0.8))
     if shaken is not None:
         return shaken
-    flat = None if views is None else _of_flat_shape(views, relaxed, measurements)
+    flat = None if views is None else _of_flat_shape(views, relaxed, measurements, noise)
     if flat is None or noise >= _TOO_NOISY:
         return flat or found
     rotations = likeliest_cameras(measurements, flat.rotations, FROM_NEAR, part_of(hook, 0.8, 1.0))
@@ -223,7 +224,7 @@ def _beyond_relaxations(
 
 
 def _of_flat_shape(
-    views: FlatViews, relaxed: _Relaxation, measurements: NDArray[np.float64]
+    views: FlatViews, relaxed: _Relaxation, measurements: NDArray[np.float64], noise: float
 ) -> CameraEstimate | None:
     """Return the cameras of a flat mean shape where the relaxations failed on one."""
     before = relaxed.complexity
@@ -233,7 +234,7 @@ def _of_flat_shape(
     views = steadier(views)
     problem = on_some_frames(measurements, views.rotations)
     now, flat = problem.complexity(), flatness(problem.shapes.reshape(problem.frames, 3, -1))
-    clearly = _CLEARLY_SIMPLER if flat < _FLAT else _FAR_SIMPLER
+    clearly = _CLEARLY_SIMPLER if flat < _FLAT or noise >= _TOO_NOISY else _FAR_SIMPLER
     if now >= clearly * before or (now >= _CREDIBLE_FLAT and before <= 1.0):
         return None
     return dataclasses.replace(
