@@ -1,6 +1,6 @@
 """Accuracy on sequences drawn at random, which no setting was chosen by.
 
-    python benchmarks/held_out.py --data ../shared/data --first 20000
+    python benchmarks/held_out.py --data ../shared/data --first 30000
 
 Each seed draws a shape of the family of camera paths, whole or in part, a path, a speed, a tilt
 and a level of noise; the default options are compared with one relaxation and the nuclear norm as
