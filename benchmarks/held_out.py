@@ -24,6 +24,7 @@ from smsr.benchmark.camera_paths import (
     geometric_mean,
     lost,
     lost_lines,
+    noisy_tracks,
     of_each_member,
     sway,
     true_shapes,
@@ -52,8 +53,7 @@ def measure(folder: Path, seed: int) -> Member:
         true = true[first : first + frames]
     tilt = sway(rng.normal(0.0, 25.0, 1), rng.normal(0.0, 40.0, 1))
     rotations = PATHS[path](speed * np.arange(len(true), dtype=np.float64), rng) @ tilt
-    W = (rotations[:, :2] @ true).reshape(2 * len(true), -1)
-    W += noise * np.abs(W).max() * rng.standard_normal(W.shape)
+    W = noisy_tracks(rotations, true, noise, rng)
     return compared((shape, path, noise), W, rotations, true)
 
 

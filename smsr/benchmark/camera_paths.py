@@ -276,8 +276,17 @@ def tracks(folder: Path, key: Key) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng(zlib.crc32(f"{name} {path} {noise}".encode()))
     times = np.arange(len(true), dtype=np.float64)
     rotations = PATHS[path](times, rng) @ sway(np.array([20.0]), 30.0)
-    W = (rotations[:, :2] @ true).reshape(2 * len(true), -1)
-    return W + noise * np.abs(W).max() * rng.standard_normal(W.shape), rotations, true
+    return noisy_tracks(rotations, true, noise, rng), rotations, true
+
+
+def noisy_tracks(rotations: Array, shapes: Array, noise: float, rng: np.random.Generator) -> Array:
+    """Return the tracks W (2T, N) of shapes (T, 3, N) that cameras (T, 3, 3) see.
+
+    The standard deviation of the noise is a part of the largest coordinate.
+    """
+    W = (rotations[:, :2] @ shapes).reshape(2 * len(shapes), -1)
+    noisy: Array = W + noise * np.abs(W).max() * rng.standard_normal(W.shape)
+    return noisy
 
 
 def with_true_cameras(W: Array, rotations: Array) -> Array:

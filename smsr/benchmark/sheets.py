@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from smsr.benchmark.camera_paths import PATHS
+from smsr.benchmark.camera_paths import PATHS, noisy_tracks
 from smsr.rotations import exp
 
 if TYPE_CHECKING:
@@ -130,5 +130,4 @@ def sheet_tracks(
     facing = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     shapes = facing @ (shapes - shapes.mean(axis=2, keepdims=True))
     rotations = PATHS[path](np.arange(frames, dtype=np.float64), rng)
-    W = (rotations[:, :2] @ shapes).reshape(2 * frames, -1)
-    return W + noise * np.abs(W).max() * rng.standard_normal(W.shape), rotations, shapes
+    return noisy_tracks(rotations, shapes, noise, rng), rotations, shapes

@@ -222,19 +222,19 @@ def shaken_cameras(
     starts, found = [rotations, *more()], []
     for i, start in enumerate(starts):
         part = part_of(hook, i / len(starts), (i + 1) / len(starts))
-        rotations = likeliest_cameras(measurements, start, FROM_FAR, part)
-        found.append((_Judged.of(measurements, rotations), i, rotations))
-    best, which, rotations = max(found, key=lambda one: one[0].log_likelihood)
-    if so3.spread_of_views(rotations) < STILL:
+        turned = likeliest_cameras(measurements, start, FROM_FAR, part)
+        found.append((_Judged.of(measurements, turned), i, turned))
+    best, which, likeliest = max(found, key=lambda one: one[0].log_likelihood)
+    if so3.spread_of_views(likeliest) < STILL:
         return None
     credible = _CREDIBLE + _CREDIBLE_BY_NOISE * noise
     if best.steadiness < max(before.steadiness + _STEADIER, credible):
         return None
     return ShakenCameras(
-        rotations=rotations,
+        rotations=likeliest,
         start=which,
         disagreement=max(
-            so3.angle_between_paths(rotations, other)
+            so3.angle_between_paths(likeliest, other)
             for judged, _, other in found
             if judged.log_likelihood > best.log_likelihood - _AS_LIKELY
         ),

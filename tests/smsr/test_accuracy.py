@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 
 from smsr import evaluate, reconstruct
-from smsr.benchmark.camera_paths import PATHS, errors, sway, true_shapes
+from smsr.benchmark.camera_paths import PATHS, errors, noisy_tracks, sway, true_shapes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -87,9 +87,7 @@ def test_a_slab_is_not_taken_for_a_sheet(evaluation_data: Path, path: str, noise
     rng = np.random.default_rng(1)
     time = 1.5 * np.arange(len(true), dtype=np.float64)
     rotations = PATHS[path](time, rng) @ sway(np.array([-20.0]), 10.0)
-    W = (rotations[:, :2] @ true).reshape(2 * len(true), -1)
-    W += noise * np.abs(W).max() * rng.standard_normal(W.shape)
-    result = reconstruct(W)
+    result = reconstruct(noisy_tracks(rotations, true, noise, rng))
     assert result.diagnostics.camera_model != "flat"
     found = errors(result.cameras, result.shapes.transpose(0, 2, 1), rotations, true)
     assert found.camera < 0.2
