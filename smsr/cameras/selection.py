@@ -18,7 +18,6 @@ from smsr.cameras.paper import published_cameras
 from smsr.cameras.rigid import looks_rigid, rigid_cameras
 from smsr.cameras.simplicity import every_frame
 from smsr.cameras.trial import Trial
-from smsr.cameras.turn import refine_velocity
 from smsr.progress import ignore, part_of
 from smsr.shapes import by_turn_speed, faded
 
@@ -137,7 +136,7 @@ def with_uniform_path(
     trial = _trial(free, measurements)
     path = trial.uniform()
     verdict = trial.measure(path)
-    turn = _refined(path, verdict, trial, hook)
+    turn, verdict = trial.refine(path, verdict, hook)
     estimate = _on_path(free, path, turn, verdict, dict(free.criteria) | _numbers(path, verdict))
     return dataclasses.replace(estimate, simpler=None, simpler_share=0.0)
 
@@ -195,7 +194,9 @@ def with_simple_path(
         if verdict.motion_weight is None:
             reasons.append(f"{path} {verdict.reason}")
             continue
-        turn = path.turn if path.is_loose else _refined(path, verdict, trial, hook)
+        turn = path.turn
+        if not path.is_loose:
+            turn, verdict = trial.refine(path, verdict, hook)
         outside = part_outside_span(measurements, turn.rotations)
         criteria[f"{path.name}_outside_span"] = outside
         limit = max(SPAN_LIMIT, part_outside_span(measurements, free.rotations))
@@ -212,25 +213,6 @@ def _numbers(path: Path, verdict: Verdict) -> dict[str, float]:
     if verdict.motion_rise is not None:
         numbers[f"{path.name}_motion_rise"] = verdict.motion_rise
     return numbers
-
-
-def _refined(path: Path, verdict: Verdict, trial: Trial, hook: StageHook) -> Turn:
-    """Return the path with the velocity that gives the best shapes.
-
-    On other than uniform paths the speed stays: a swing may be wider for shapes that are flatter,
-    and flatter ones are simpler.
-    """
-    some = refine_velocity(
-        path.turn.every(trial.step),
-        trial.measurements,
-        motion_weight=verdict.motion_weight or 0.0,
-        hook=hook,
-    )
-    velocity = some.velocity
-    if not path.is_certain:
-        speed = float(np.linalg.norm(path.turn.velocity))
-        velocity = velocity * (speed / max(float(np.linalg.norm(velocity)), np.finfo(float).tiny))
-    return dataclasses.replace(path.turn, velocity=velocity)
 
 
 def _on_path(

@@ -21,14 +21,16 @@ from smsr.cameras.gimbal import fit_gimbal
 from smsr.cameras.paces import fit_paces, score
 from smsr.cameras.rest import resting_frame
 from smsr.cameras.switched import fit_switched_turn
-from smsr.cameras.turn import with_shake
+from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
+from smsr.progress import ignore
 from smsr.shapes import DepthProblem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smsr.cameras.turn import Turn
+    from smsr.progress import StageHook
 
 UNEXPLAINED_LIMIT = 0.1
 """Part of the rotation variance of the free cameras that a path may leave unexplained."""
@@ -273,6 +275,29 @@ class Trial:
             _MOTION_WEIGHT * gain * nuclear / motion,
             float(self._free.spectrum().sum()) / max(nuclear, tiny),
         )
+
+    def refine(
+        self, path: Path, verdict: Verdict, hook: StageHook = ignore
+    ) -> tuple[Turn, Verdict]:
+        """Return the turn with the velocity that gives the best shapes, and how simple they are.
+
+        On other than uniform paths the speed stays: a swing may be wider for shapes that are
+        flatter, and flatter ones are simpler.
+        """
+        some, gain = refine_velocity(
+            path.turn.every(self.step),
+            self.measurements,
+            motion_weight=verdict.motion_weight or 0.0,
+            hook=hook,
+        )
+        velocity = some.velocity
+        if not path.is_certain:
+            speed = float(np.linalg.norm(path.turn.velocity))
+            velocity = velocity * (
+                speed / max(float(np.linalg.norm(velocity)), np.finfo(float).tiny)
+            )
+        turn = dataclasses.replace(path.turn, velocity=velocity)
+        return turn, dataclasses.replace(verdict, simplicity=gain * verdict.simplicity)
 
     def _solve(self, rotations: NDArray[np.float64]) -> DepthProblem:
         """Return the best shapes for some cameras."""

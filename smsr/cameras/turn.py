@@ -138,7 +138,7 @@ def refine_velocity(
     motion_weight: float,
     evaluations: int = 30,
     hook: StageHook = ignore,
-) -> Turn:
+) -> tuple[Turn, float]:
     """Return the turn at the velocity whose best shape has least energy.
 
     The energy is ``||P S#||_* + lambda/2 ||D S#||_F^2``, minimised over the shapes with W = R S
@@ -156,24 +156,31 @@ def refine_velocity(
         Most evaluations of the energy.
     hook : callable
         See `smsr.progress.StageHook`.
+
+    Returns
+    -------
+    turn : Turn
+        With that velocity.
+    gain : float
+        Nuclear norm of the best shapes at the given velocity over that at the new one.
     """
     problem = DepthProblem(measurements, turn.rotations)
     problem.start_from_least_motion()
     problem.motion_weight = motion_weight
-    count = 0
+    values: list[tuple[float, float]] = []
 
     def at(x: NDArray[np.float64]) -> Turn:
         return dataclasses.replace(turn, velocity=turn.velocity + x / turn.span)
 
     def energy(x: NDArray[np.float64], *_: object) -> tuple[float, NDArray[np.float64]]:
-        nonlocal count
         now = at(x)
         problem.turn_to(now.rotations)
         problem.minimise(60, 3e-4)
-        count += 1
-        hook(min(count / evaluations, 1.0), count, problem.residuals[-1])
+        value = problem.value()
+        values.append((value, value - 0.5 * motion_weight * problem.motion()))
+        hook(min(len(values) / evaluations, 1.0), len(values), problem.residuals[-1])
         gradient = np.tensordot(now.by_velocity(), problem.camera_gradient(), axes=2)
-        return problem.value(), gradient / turn.span
+        return value, gradient / turn.span
 
     found = minimize(
         energy,
@@ -182,4 +189,4 @@ def refine_velocity(
         method="L-BFGS-B",
         options={"maxiter": evaluations, "maxfun": evaluations, "ftol": 1e-5},  # of the energy
     )
-    return at(found.x)
+    return at(found.x), values[0][1] / max(min(values)[1], np.finfo(float).tiny)

@@ -31,6 +31,7 @@ from smsr.cameras.rigid import looks_rigid, rigid_cameras
 from smsr.cameras.selection import part_outside_span, with_simple_path, with_uniform_path
 from smsr.cameras.simplicity import complexity
 from smsr.cameras.switched import choose_breaks, correlation_length, fit_switched_turn, segment
+from smsr.cameras.trial import Path, Trial
 from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
 from tests.factored import factored
@@ -523,9 +524,12 @@ class TestTurn:
             off = dataclasses.replace(
                 exact, velocity=turn.velocity + np.radians([0.05, 0.1, -0.05])
             )
-            refined = refine_velocity(off, left * values, motion_weight=0.1)
+            refined, gain = refine_velocity(off, left * values, motion_weight=0.1)
             error = np.linalg.norm(refined.velocity - turn.velocity)
             assert error < 0.3 * np.linalg.norm(off.velocity - turn.velocity)
+            assert gain > 1.0
+            _, no_gain = refine_velocity(refined, left * values, motion_weight=0.1)
+            assert no_gain == pytest.approx(1.0, abs=0.01)
 
 
 class TestUniform:
@@ -775,6 +779,18 @@ class TestSelection:
         estimate = with_simple_path(free, left * values)
         assert estimate.model == "relaxed"
         np.testing.assert_array_equal(estimate.rotations, free.rotations)
+
+    def test_shapes_on_a_path_are_as_simple_as_the_refined_one_makes_them(self) -> None:
+        true = orbit(60)
+        left, values = low_rank(true, modes=1)
+        turn = fit_uniform_turn(true)
+        velocity = turn.velocity + np.radians([0.05, 0.1, -0.05])
+        off = Path("uniform", dataclasses.replace(turn, velocity=velocity))
+        trial = Trial(left * values, true, 1)
+        found = trial.measure(off)
+        _, refined = trial.refine(off, found)
+        assert found.simplicity < 0.8
+        assert refined.simplicity > 0.93
 
     @pytest.mark.parametrize("frames", [80, 900])
     def test_points_at_rest_take_the_drift_of_free_cameras_away(self, frames: int) -> None:
