@@ -370,17 +370,74 @@ def estimate_shapes(
 
     def solve(
         cameras: NDArray[np.float64],
-        weight: float = 1.0,
-        *,
-        deep: bool = False,
+        weight: float,
         adjustable: NDArray[np.float64] | None = None,
     ) -> ShapeEstimate:
-        if weight < _LITTLE:
-            return reweighted_shapes(measurements, cameras, deep=deep, **limits)
+        return believable_shapes(
+            measurements,
+            cameras,
+            weight=weight,
+            adjustable=adjustable,
+            noise=noise,
+            points=points,
+            **limits,
+        )
+
+    found = solve(rotations, 1.0 - share, adjustable)
+    if simpler is None or share == 0.0:
+        return found
+    if found.rotations is not None:
+        rotations = found.rotations
+    return with_mean_depth(found, rotations, solve(simpler, share), simpler, share)
+
+
+def believable_shapes(
+    measurements: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    *,
+    weight: float = 1.0,
+    adjustable: NDArray[np.float64] | None = None,
+    noise: float = 0.0,
+    points: NDArray[np.float64] | None = None,
+    max_iterations: int = 1000,
+    tolerance: float = 1e-4,
+    hook: StageHook = ignore,
+    **problem: Any,
+) -> ShapeEstimate:
+    """Find the shapes that some cameras see, with as much depth as can be believed.
+
+    They are simple ones (`reweighted_shapes`), refined to likely depths (`with_likely_depth`), with
+    less depth or more where that is doubtful (`credible_depth`, `with_deep_shapes`).
+
+    Parameters
+    ----------
+    measurements, rotations, max_iterations, tolerance, hook
+        As for `low_rank_shapes`.
+    weight : float
+        Part of the result that the shapes will make: refining a little is not worth the time.
+    adjustable, noise, points
+        See `estimate_shapes`.
+    **problem
+        `motion_weight` and `coherent` of `reweighted_shapes`.
+    """
+
+    def enter(
+        cameras: NDArray[np.float64], adjustable: NDArray[np.float64] | None, *, deep: bool
+    ) -> ShapeEstimate:
+        refined = weight >= _LITTLE
         first, second = part_of(hook, 0.0, 0.4), part_of(hook, 0.4, 1.0)
-        # The start of a refinement need not be so exact: five times here move the end by 0.1 %.
-        rough = {"tolerance": _ROUGHLY * options.shape_tolerance, "hook": first}
-        found = reweighted_shapes(measurements, cameras, deep=deep, **limits | rough)
+        found = reweighted_shapes(
+            measurements,
+            cameras,
+            deep=deep,
+            max_iterations=max_iterations,
+            # The start of a refinement need not be so exact: five times here move the end by 0.1 %.
+            tolerance=_ROUGHLY * tolerance if refined else tolerance,
+            hook=first if refined else hook,
+            **problem,
+        )
+        if not refined:
+            return found
         return with_likely_depth(
             found,
             cameras,
@@ -388,19 +445,17 @@ def estimate_shapes(
             points=points,
             adjustable=adjustable,
             doubtful=deep,
-            max_iterations=options.shape_iterations,
+            max_iterations=max_iterations,
             hook=second,
         )
 
-    found = solve(rotations, 1.0 - share, adjustable=adjustable)
+    found = enter(rotations, adjustable, deep=False)
     if found.rotations is not None:
         rotations = found.rotations
-    if simpler is not None and share > 0.0:
-        found = with_mean_depth(found, rotations, solve(simpler, share), simpler, share)
     found = credible_depth(found, rotations)
     if found.complexity < DOUBTFUL or _trust(noise) == 0.0:
         return found
-    return with_deep_shapes(found, solve(rotations, deep=True), rotations, noise)
+    return with_deep_shapes(found, enter(rotations, None, deep=True), rotations, noise)
 
 
 def low_rank_shapes(

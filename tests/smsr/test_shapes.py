@@ -376,6 +376,19 @@ class TestLikelyDepth:
         found = estimate_shapes(W, rotations, Options(), simpler=free, simpler_share=share)
         assert found.reason.count("Gaussian") == refined
 
+    def test_doubtful_depths_of_two_cameras_are_found_apart(self) -> None:
+        shapes = sequence(modes=2)[2]
+        turn = np.linspace(0.0, 0.5, len(shapes))[:, None]
+        rotations = so3.exp(turn * np.array([0.1, 1.0, 0.2]))
+        free = so3.exp(0.2 * turn * np.array([1.0, 0.0, 0.0])) @ rotations
+        W = (rotations[:, :2] @ shapes).reshape(2 * len(shapes), -1)
+        W /= np.linalg.norm(W, 2)
+        both = estimate_shapes(W, rotations, Options(), simpler=free, simpler_share=0.5)
+        one, other = (estimate_shapes(W, each, Options()) for each in (rotations, free))
+        assert "full depth" in one.reason
+        depths = 0.5 * (rotations @ one.shapes + free @ other.shapes)[:, 2]
+        np.testing.assert_allclose((rotations @ both.shapes)[:, 2], depths, atol=1e-9)
+
     def test_weak_directions_keep_their_depth(self) -> None:
         W, rotations, _ = sequence(points=40, modes=4)
         rng = np.random.default_rng(0)
