@@ -17,7 +17,7 @@ from smsr import rotations as so3
 from smsr.cameras.constraints import orthonormality_form
 from smsr.cameras.estimate import STILL, scaled_motion, usable_rank
 from smsr.cameras.flat import FlatViews, flat_views, steadier
-from smsr.cameras.likeliest import FROM_NEAR, likeliest_cameras, shaken_cameras
+from smsr.cameras.likeliest import shaken_cameras, with_likelier_cameras
 from smsr.cameras.relaxed import relaxed_cameras
 from smsr.cameras.rigid import part_beyond
 from smsr.cameras.simplicity import complexity, flatness, on_some_frames
@@ -213,14 +213,7 @@ def _beyond_relaxations(
     flat = None if views is None else _of_flat_shape(views, relaxed, measurements, noise)
     if flat is None or noise >= _TOO_NOISY:
         return flat or found
-    rotations = likeliest_cameras(measurements, flat.rotations, FROM_NEAR, part_of(hook, 0.8, 1.0))
-    criteria = {"complexity": complexity(measurements, rotations)}
-    return dataclasses.replace(
-        flat,
-        rotations=rotations,
-        criteria=dict(flat.criteria) | criteria,
-        reason=f"{flat.reason}; turned to where they make the tracks likeliest",
-    )
+    return with_likelier_cameras(flat, measurements, part_of(hook, 0.8, 1.0))
 
 
 def _of_flat_shape(

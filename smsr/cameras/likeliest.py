@@ -5,12 +5,14 @@ they lead it astray. If it shakes, as one that is held in the hand, the tracks t
 object moves to and fro from frame to frame as its image does then. The Gaussian model of the
 deformation (`smsr.deformation`), in which consecutive shapes are alike, puts a number on it, and
 the cameras follow its gradient together with the depths. Relaxed cameras that turn slowly must not
-be left to it: what the object does as slowly is then as likely the camera's. Those of a flat mean
-shape may, for they are off by what the object bends.
+be left to it: what the object does as slowly is then as likely the camera's. They may where noise
+has put them off by more than that, and so may those of a flat mean shape, off by what the object
+bends.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -20,7 +22,7 @@ from scipy.linalg import solveh_banded
 
 from smsr import rotations as so3
 from smsr.cameras.estimate import STILL
-from smsr.cameras.simplicity import DIRECTIONS, flatness, roughly_solved
+from smsr.cameras.simplicity import DIRECTIONS, complexity, flatness, roughly_solved
 from smsr.deformation import (
     as_seen,
     condition,
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from smsr.cameras.estimate import CameraEstimate
     from smsr.deformation import Deformation
     from smsr.progress import StageHook
 
@@ -49,10 +52,15 @@ degrees: a high one lets them go far, a low one tells small errors."""
 FROM_NEAR = ((0.01, 40), (0.005, 20), (0.0025, 20))
 """The same from cameras that are nearly right."""
 
+NOISY, SIMPLE = 0.1, 0.5
+"""Noise that was taken off, as a part of the tracks' spread, from which on it errs less than the
+relaxations do, where the complexity of the shapes that they give is below the second number."""
+
 _FRAMES_IN_ALL_ROUNDS = 1000
 _FEWEST_ROUNDS = 10
 _ROUNDS_WITHOUT_TURNS = 5  # until the model has left the shapes that it was learnt from first
 _LONGEST_STEP = math.radians(3.0)
+_LENGTHENED = 2.0  # steps from near; from far, more of them would follow noise
 _LEAST_CURVATURE = 1e-3  # of the mean one
 
 _JUDGED_FRAMES = 400
@@ -70,6 +78,8 @@ def likeliest_cameras(
     rotations: NDArray[np.float64],
     stages: Sequence[tuple[float, int]],
     hook: StageHook = ignore,
+    *,
+    lengthened: float = 1.0,
 ) -> NDArray[np.float64]:
     """Turn the cameras of all frames, each by itself, to where they make the tracks likelier.
 
@@ -88,6 +98,8 @@ def likeliest_cameras(
         reduced for more than 1000 frames.
     hook : callable
         See `smsr.progress.StageHook`.
+    lengthened : float
+        Factor on the steps, up to 2.
 
     Returns
     -------
@@ -110,7 +122,7 @@ def likeliest_cameras(
             if iteration > _ROUNDS_WITHOUT_TURNS:
                 shapes = planar + axis[:, :, None] * posterior.depths[:, None]
                 force = turning_force(model, planar, rotations, posterior)
-                turns = _newton_step(model, rotations, shapes, force)
+                turns = lengthened * _newton_step(model, rotations, shapes, force)
                 longest = float(np.linalg.norm(turns, axis=1).max())
                 turns *= min(1.0, _LONGEST_STEP / max(longest, np.finfo(float).tiny))
                 rotations = so3.exp(turns) @ rotations
@@ -122,6 +134,29 @@ def likeliest_cameras(
     return rotations
 
 
+def with_likelier_cameras(
+    estimate: CameraEstimate, measurements: NDArray[np.float64], hook: StageHook = ignore
+) -> CameraEstimate:
+    """Return cameras that are nearly right turned to where they make the tracks likeliest.
+
+    Parameters
+    ----------
+    estimate : CameraEstimate
+        What it says of how they were found stays, but for their complexity.
+    measurements, hook
+        As for `likeliest_cameras`.
+    """
+    rotations = likeliest_cameras(
+        measurements, estimate.rotations, FROM_NEAR, hook, lengthened=_LENGTHENED
+    )
+    return dataclasses.replace(
+        estimate,
+        rotations=rotations,
+        criteria=dict(estimate.criteria) | {"complexity": complexity(measurements, rotations)},
+        reason=f"{estimate.reason}; turned to where they make the tracks likeliest",
+    )
+
+
 def _newton_step(
     deformation: Deformation,
     rotations: NDArray[np.float64],
@@ -131,7 +166,7 @@ def _newton_step(
     """Return the turns (T, 3) of the cameras that the gradient (T, 3) leads to.
 
     The curvature is that of the log-density of the shapes with their depths held at the mean. Free
-    depths would make it less, so steps are short rather than long.
+    depths would make it less, so steps up to twice as long are safe.
     """
     frames, _, points = shapes.shape
     seen = rotations @ shapes

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smsr.cameras.free import free_cameras
+from smsr.cameras.likeliest import NOISY, SIMPLE, with_likelier_cameras
 from smsr.cameras.paper import published_cameras
 from smsr.cameras.rigid import looks_rigid, rigid_cameras
 from smsr.cameras.simplicity import every_frame
@@ -113,7 +114,7 @@ def estimate_cameras(
     hook = part_of(hook, 0.5, 1.0)
     if options.camera_model == "uniform":
         return with_uniform_path(free, left * values, hook)
-    return with_simple_path(free, left * values, hook, points=points, denoised=noise > 0.0)
+    return with_simple_path(free, left * values, hook, points=points, noise=noise)
 
 
 def _trial(free: CameraEstimate, measurements: NDArray[np.float64]) -> Trial:
@@ -147,11 +148,13 @@ def with_simple_path(
     hook: StageHook = ignore,
     *,
     points: NDArray[np.float64] | None = None,
-    denoised: bool = False,
+    noise: float = 0.0,
 ) -> CameraEstimate:
     """Return cameras on a simple path where one explains the free ones.
 
-    Otherwise those are returned, turned to the frame in which points rest, if any do.
+    Otherwise those are returned, turned to the frame in which points rest, if any do. In very noisy
+    tracks they are turned to where they make the tracks likeliest before. Paths are recognised
+    better without.
 
     Parameters
     ----------
@@ -163,9 +166,9 @@ def with_simple_path(
         See `smsr.progress.StageHook`.
     points : ndarray of shape (q, s), optional
         See `estimate_cameras`.
-    denoised : bool
-        Weak directions of the measurements went with their noise, and part of what spans the
-        cameras with them: do not ask that paths lie in the span.
+    noise : float
+        See `estimate_cameras`. Weak directions of the measurements went with it, and part of what
+        spans the cameras with them, so it is not asked that paths lie in the span.
 
     Returns
     -------
@@ -176,15 +179,8 @@ def with_simple_path(
     if len(free.rotations) < FEWEST_FRAMES:
         return free
     trial = _trial(free, measurements)
-    criteria = dict(free.criteria)
-    still, reasons = free, []
-    if points is not None:
-        criteria["unrest"], trust = trial.come_to_rest(points[:_DIRECTIONS])
-        if trust > 0.0:
-            still = dataclasses.replace(
-                free, rotations=trial.rotations, simpler=free.rotations, simpler_share=1.0
-            )
-            reasons.append(f"turned to where points rest, by {trust:.0%} of the way")
+    still = _at_rest(free, trial, points)
+    criteria, reasons = dict(still.criteria), []
     paths = trial.paths()
     if not paths:
         reasons.append("the cameras keep to no axis")
@@ -200,11 +196,36 @@ def with_simple_path(
         outside = part_outside_span(measurements, turn.rotations)
         criteria[f"{path.name}_outside_span"] = outside
         limit = max(SPAN_LIMIT, part_outside_span(measurements, free.rotations))
-        if outside > limit and not denoised and not trial.flat:
+        if outside > limit and noise == 0.0 and not trial.flat:
             reasons.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
             continue
         return _on_path(free, path, turn, verdict, criteria)
-    return dataclasses.replace(still, criteria=criteria, reason="; ".join([*reasons, free.reason]))
+    simple = free.criteria.get("complexity", 1.0) < SIMPLE
+    if noise >= NOISY and simple and free.model == "relaxed":
+        free = with_likelier_cameras(free, measurements, hook)
+        still = _at_rest(free, _trial(free, measurements), points)
+        criteria |= still.criteria
+    reason = "; ".join([*reasons, still.reason])
+    return dataclasses.replace(still, criteria=criteria, reason=reason)
+
+
+def _at_rest(
+    free: CameraEstimate, trial: Trial, points: NDArray[np.float64] | None
+) -> CameraEstimate:
+    """Return free cameras, and put those on trial, turned to the frame in which points rest."""
+    if points is None:
+        return free
+    unrest, trust = trial.come_to_rest(points[:_DIRECTIONS])
+    free = dataclasses.replace(free, criteria=dict(free.criteria) | {"unrest": unrest})
+    if trust == 0.0:
+        return free
+    return dataclasses.replace(
+        free,
+        rotations=trial.rotations,
+        simpler=free.rotations,
+        simpler_share=1.0,
+        reason=f"turned to where points rest, by {trust:.0%} of the way; {free.reason}",
+    )
 
 
 def _numbers(path: Path, verdict: Verdict) -> dict[str, float]:

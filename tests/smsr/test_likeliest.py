@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from smsr import rotations as so3
-from smsr.benchmark.camera_paths import errors, handheld
+from smsr.benchmark.camera_paths import PATHS, errors, handheld, noisy_tracks
 from smsr.benchmark.sheets import sheet_tracks
 from smsr.cameras.flat import flat_views
 from smsr.cameras.free import free_cameras
@@ -211,3 +211,35 @@ class TestFreeCamerasThatShake:
         assert len(fractions) > 100
         assert fractions == sorted(fractions)
         assert fractions[-1] <= 1.0
+
+
+class TestFreeCamerasOfNoisyTracks:
+    @staticmethod
+    def noisy(path: str, seed: int, noise: float = 0.05) -> tuple[Array, Array, Array]:
+        """Return W (2T, N), the cameras and the shapes."""
+        shapes = shaken(seed=seed)[2]
+        rng = np.random.default_rng(seed)
+        rotations = PATHS[path](np.arange(len(shapes), dtype=np.float64), rng)
+        return noisy_tracks(rotations, shapes, noise, rng), rotations, shapes
+
+    @pytest.mark.parametrize("seed", [1, 2, 3])
+    def test_they_are_turned_to_where_the_tracks_are_likeliest(self, seed: int) -> None:
+        W, rotations, shapes = self.noisy("lissajous", seed)
+        result, relaxed = (reconstruct(W, camera_model=model) for model in ("auto", "relaxed"))
+        found, without = (
+            errors(each.cameras, each.shapes.transpose(0, 2, 1), rotations, shapes).object
+            for each in (result, relaxed)
+        )
+        assert found < 0.95 * without
+        diagnostics = result.diagnostics
+        assert diagnostics.camera_model == "relaxed"
+        assert "tracks likeliest" in diagnostics.camera_reason
+        assert "tracks likeliest" not in relaxed.diagnostics.camera_reason
+        before = relaxed.diagnostics.camera_criteria["complexity"]
+        assert diagnostics.camera_criteria["complexity"] < before
+
+    @pytest.mark.parametrize(("path", "noise"), [("fast", 0.05), ("lissajous", 0.01)])
+    def test_those_on_a_path_or_with_less_noise_are_not(self, path: str, noise: float) -> None:
+        diagnostics = reconstruct(self.noisy(path, 1, noise)[0]).diagnostics
+        assert diagnostics.camera_model == ("uniform" if path == "fast" else "relaxed")
+        assert "tracks likeliest" not in diagnostics.camera_reason
