@@ -953,7 +953,8 @@ def with_mean_depth(
     """Return shapes with a mean of the depths that two sets of cameras see.
 
     An object that turns as a whole looks simpler to cameras that turn with it. Their depths may
-    then be the better ones, though their path is not the camera's.
+    then be the better ones, though their path is not the camera's. Complexity and steadiness are
+    means, too.
 
     Parameters
     ----------
@@ -972,6 +973,8 @@ def with_mean_depth(
     return dataclasses.replace(
         estimate,
         shapes=estimate.shapes + share * (turned - estimate.shapes),
+        complexity=estimate.complexity + share * (other.complexity - estimate.complexity),
+        steadiness=estimate.steadiness + share * (other.steadiness - estimate.steadiness),
         iterations=estimate.iterations + other.iterations,
         converged=estimate.converged and other.converged,
         reason=f"{estimate.reason}; free cameras, {share:.0%} of their depths: {other.reason}",

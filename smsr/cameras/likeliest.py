@@ -53,14 +53,14 @@ FROM_NEAR = ((0.01, 40), (0.005, 20), (0.0025, 20))
 """The same from cameras that are nearly right."""
 
 NOISY, SIMPLE = 0.1, 0.5
-"""Noise that was taken off, as a part of the tracks' spread, from which on it errs less than the
-relaxations do, where the complexity of the shapes that they give is below the second number."""
+"""Noise that was taken off, as a part of the tracks' spread, from which on the likelihood errs less
+than the relaxations do, where these give shapes of a complexity below the second number."""
 
 _FRAMES_IN_ALL_ROUNDS = 1000
 _FEWEST_ROUNDS = 10
 _ROUNDS_WITHOUT_TURNS = 5  # until the model has left the shapes that it was learnt from first
 _LONGEST_STEP = math.radians(3.0)
-_LENGTHENED = 2.0  # steps from near; from far, more of them would follow noise
+_LENGTHENED = 2.0  # steps from near; from far, longer ones would follow noise
 _LEAST_CURVATURE = 1e-3  # of the mean one
 
 _JUDGED_FRAMES = 400
@@ -142,7 +142,7 @@ def with_likelier_cameras(
     Parameters
     ----------
     estimate : CameraEstimate
-        What it says of how they were found stays, but for their complexity.
+        Its reason is extended, and its complexity replaced.
     measurements, hook
         As for `likeliest_cameras`.
     """

@@ -152,9 +152,9 @@ def with_simple_path(
 ) -> CameraEstimate:
     """Return cameras on a simple path where one explains the free ones.
 
-    Otherwise those are returned, turned to the frame in which points rest, if any do. In very noisy
-    tracks they are turned to where they make the tracks likeliest before. Paths are recognised
-    better without.
+    Otherwise those are returned, turned to the frame in which points rest, if any do. Relaxed ones
+    of simple shapes are turned to where they make the tracks likeliest first, where noise is much;
+    not before paths are looked for, which are recognised better without.
 
     Parameters
     ----------

@@ -281,8 +281,9 @@ class Trial:
     ) -> tuple[Turn, Verdict]:
         """Return the turn with the velocity that gives the best shapes, and how simple they are.
 
-        On other than uniform paths the speed stays: a swing may be wider for shapes that are
-        flatter, and flatter ones are simpler.
+        On other than certain paths the speed stays: a swing may be wider for shapes that are
+        flatter, and flatter ones are simpler. How simple they are is told for the speed that was
+        found.
         """
         some, gain = refine_velocity(
             path.turn.every(self.step),

@@ -162,7 +162,8 @@ def refine_velocity(
     turn : Turn
         With that velocity.
     gain : float
-        Nuclear norm of the best shapes at the given velocity over that at the new one.
+        Nuclear norm of the best shapes at the given velocity over that at the velocity of least
+        energy that was seen.
     """
     problem = DepthProblem(measurements, turn.rotations)
     problem.start_from_least_motion()

@@ -11,6 +11,7 @@ from smsr.deformation import LikelyShapes, likely_shapes
 from smsr.lengths import Lengths, chosen_points
 from smsr.options import Options
 from smsr.shapes import (
+    DOUBTFUL,
     DepthProblem,
     ShapeEstimate,
     basis_size_of,
@@ -604,6 +605,16 @@ class TestTwoSolutions:
             np.testing.assert_allclose(mean[:, :2].reshape(W.shape), W, atol=1e-9)
             depths = (1.0 - share) * (rotations @ found.shapes)[:, 2] + share * seen[:, 2]
             np.testing.assert_allclose(mean[:, 2], depths, atol=1e-9)
+
+    def test_of_two_cameras_those_of_more_weight_tell_how_sure_depth_is(self) -> None:
+        W, rotations, _ = shaken(60)
+        W = W / np.linalg.norm(W, 2)
+        alone = estimate_shapes(W, rotations, Options())
+        found = estimate_shapes(W, rotations, Options(), simpler=rotations, simpler_share=0.9)
+        assert alone.steadiness > 0.5
+        assert alone.complexity > DOUBTFUL
+        assert found.steadiness >= 0.9 * alone.steadiness
+        assert found.complexity == pytest.approx(alone.complexity, abs=0.05)
 
 
 class TestRigid:
