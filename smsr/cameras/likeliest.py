@@ -52,10 +52,6 @@ degrees: a high one lets them go far, a low one tells small errors."""
 FROM_NEAR = ((0.01, 40), (0.005, 20), (0.0025, 20))
 """The same from cameras that are nearly right."""
 
-NOISY, SIMPLE = 0.1, 0.5
-"""Noise that was taken off, as a part of the tracks' spread, from which on the likelihood errs less
-than the relaxations do, where these give shapes of a complexity below the second number."""
-
 _FRAMES_IN_ALL_ROUNDS = 1000
 _FEWEST_ROUNDS = 10
 _ROUNDS_WITHOUT_TURNS = 5  # until the model has left the shapes that it was learnt from first

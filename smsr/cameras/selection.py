@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smsr.cameras.free import free_cameras
-from smsr.cameras.likeliest import NOISY, SIMPLE, with_likelier_cameras
+from smsr.cameras.likeliest import with_likelier_cameras
 from smsr.cameras.paper import published_cameras
 from smsr.cameras.rigid import looks_rigid, rigid_cameras
 from smsr.cameras.simplicity import every_frame
@@ -50,6 +50,10 @@ free cameras does."""
 
 FEWEST_FRAMES = 12
 """Paths are fitted to at least so many frames."""
+
+_VERY_NOISY, _SIMPLE = 0.1, 0.5
+"""Noise that was taken off, as a part of the tracks' spread, from which on the likelihood errs less
+than the relaxations do, where these give shapes of a complexity below the second number."""
 
 _FRAMES = 400
 _DIRECTIONS = 24
@@ -179,7 +183,7 @@ def with_simple_path(
     if len(free.rotations) < FEWEST_FRAMES:
         return free
     trial = _trial(free, measurements)
-    still = _at_rest(free, trial, points)
+    still = free if points is None else _at_rest(free, trial, points)
     criteria, reasons = dict(still.criteria), []
     paths = trial.paths()
     if not paths:
@@ -200,21 +204,18 @@ def with_simple_path(
             reasons.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
             continue
         return _on_path(free, path, turn, verdict, criteria)
-    simple = free.criteria.get("complexity", 1.0) < SIMPLE
-    if noise >= NOISY and simple and free.model == "relaxed":
-        free = with_likelier_cameras(free, measurements, hook)
-        still = _at_rest(free, _trial(free, measurements), points)
+    simple = free.criteria.get("complexity", 1.0) < _SIMPLE
+    if noise >= _VERY_NOISY and simple and free.model == "relaxed":
+        still = free = with_likelier_cameras(free, measurements, hook)
+        if points is not None:
+            still = _at_rest(free, _trial(free, measurements), points)
         criteria |= still.criteria
     reason = "; ".join([*reasons, still.reason])
     return dataclasses.replace(still, criteria=criteria, reason=reason)
 
 
-def _at_rest(
-    free: CameraEstimate, trial: Trial, points: NDArray[np.float64] | None
-) -> CameraEstimate:
+def _at_rest(free: CameraEstimate, trial: Trial, points: NDArray[np.float64]) -> CameraEstimate:
     """Return free cameras, and put those on trial, turned to the frame in which points rest."""
-    if points is None:
-        return free
     unrest, trust = trial.come_to_rest(points[:_DIRECTIONS])
     free = dataclasses.replace(free, criteria=dict(free.criteria) | {"unrest": unrest})
     if trust == 0.0:
