@@ -8,8 +8,9 @@ the flattest. Here the shapes of all frames are one sample of a Gaussian process
 and the depths, conditioned on the tracks, are its posterior mean. Mean and covariance are learnt
 from the same tracks by expectation and maximisation (Dempster, Laird, Rubin 1977), the correlation
 by its moment (Yule, Walker). Unlike in a penalised fit, depths that are uncertain count in Sigma
-with their uncertainty, which keeps it from shrinking onto what was found first. L. Torresani,
-A. Hertzmann, C. Bregler (PAMI 2008) model basis weights so; here the whole shape is the state.
+with their uncertainty, which keeps it from shrinking onto what was found first, and where few
+shapes are independent it is mixed with a simpler one. L. Torresani, A. Hertzmann, C. Bregler
+(PAMI 2008) model basis weights so; here the whole shape is the state.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class Deformation:
     @cached_property
     def precision(self) -> NDArray[np.float64]:
         """The inverse of the covariance."""
-        return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+        return _inverse(self.covariance, np.tri(len(self.covariance), dtype=bool))
 
     def temporal_precision(self, frames: int) -> tuple[NDArray[np.float64], float]:
         """Return diagonal (T,) and off-diagonal of the inverse of ``a^|s - t|``, T >= 2."""
@@ -124,6 +125,7 @@ def likely_shapes(
     floor: float,
     max_iterations: int,
     tolerance: float,
+    shrinkage: float = 0.0,
     lengths: Lengths | None = None,
     adjustment: Adjustment | None = None,
     hook: StageHook = ignore,
@@ -146,6 +148,8 @@ def likely_shapes(
         Most rounds, at least 1.
     tolerance : float
         Change of the depths in a round, as a part of the deformation, at which to stop.
+    shrinkage : float
+        See `learnt`.
     lengths : Lengths, optional
         Distances between points, some of which keep. They take part once the depths have settled
         without them, and from three fifths of the rounds on anyway.
@@ -161,7 +165,7 @@ def likely_shapes(
     flat = shapes.reshape(frames, -1)
     size = float(np.linalg.norm(flat - flat.mean(axis=0)))
     variance = least_variance(shapes, floor)
-    deformation = first_model(shapes, axis, variance)
+    deformation = first_model(shapes, axis, variance, shrinkage)
     # Lengths hold on to depths that they find: a face that still was too flat stayed so.
     joins = math.ceil(_ROUNDS_WITHOUT_LENGTHS * max_iterations)
     fewest, support = _FEWEST_ROUNDS, 0.0
@@ -189,7 +193,7 @@ def likely_shapes(
         if len(latest) == 3:
             latest = [extrapolated(*latest)]
         shapes = planar + axis[:, :, None] * latest[-1][:, None]
-        deformation = learnt(deformation, shapes, axis, posterior, variance)
+        deformation = learnt(deformation, shapes, axis, posterior, variance, shrinkage=shrinkage)
     shapes = planar + axis[:, :, None] * latest[-1][:, None]
     return LikelyShapes(shapes, deformation, iteration, change, support)
 
@@ -215,9 +219,12 @@ def least_variance(shapes: NDArray[np.float64], floor: float) -> float:
 
 
 def first_model(
-    shapes: NDArray[np.float64], axis: NDArray[np.float64], variance: float
+    shapes: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    variance: float,
+    shrinkage: float = 0.0,
 ) -> Deformation:
-    """Return the model of shapes (T, 3, q) that are taken for certain, with a least variance."""
+    """Return the model of shapes (T, 3, q) that are taken for certain, otherwise as `learnt`."""
     frames, _, points = shapes.shape
     flat = shapes.reshape(frames, -1)
     certain = np.zeros((frames, points, points))
@@ -227,6 +234,7 @@ def first_model(
         axis,
         Posterior(depths_along(axis, shapes), certain, certain[1:]),
         variance,
+        shrinkage=shrinkage,
         keep_correlation=True,
     )
 
@@ -459,8 +467,8 @@ def _through_time(
 def _inverse(matrix: NDArray[np.float64], below: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the inverse of a symmetric positive definite matrix, near it where it is not.
 
-    By its Cholesky factor, which takes half the time of a general inverse. `below` is true on and
-    below the diagonal.
+    By its Cholesky factor, which takes half the time of a general inverse and errs less. `below` is
+    true on and below the diagonal.
     """
     factor, failed = dpotrf(matrix, lower=1, clean=0)
     if failed:
@@ -479,6 +487,7 @@ def learnt(
     posterior: Posterior,
     variance: float,
     *,
+    shrinkage: float = 0.0,
     keep_correlation: bool = False,
 ) -> Deformation:
     """Return the model of the largest expected likelihood, with a least variance.
@@ -498,6 +507,10 @@ def learnt(
         Of the depths, see `condition`.
     variance : float
         See `least_variance`.
+    shrinkage : float
+        Part of a simpler model in a covariance learnt from a single shape, as a multiple of what
+        the shape says. 0 where cameras are turned or judged one by one: they would be turned to
+        explain motion that only the simpler model knows of.
     keep_correlation : bool
         Leave the correlation as it was.
     """
@@ -524,8 +537,31 @@ def learnt(
         * (same + correlation**2 * (same - at_ends) - correlation * (following + following.T))
     )
     covariance = 0.5 * (covariance + covariance.T)
+    if shrinkage > 0.0:
+        covariance = _shrunk(covariance, frames, correlation, shrinkage)
     covariance[np.diag_indices_from(covariance)] += variance
     return Deformation(mean, covariance, correlation)
+
+
+def _shrunk(
+    covariance: NDArray[np.float64], frames: int, correlation: float, shrinkage: float
+) -> NDArray[np.float64]:
+    """Return a covariance (3q, 3q) that is as unsure as one learnt from few shapes must be.
+
+    Of T frames about ``T (1 - a^2) / (1 + a^2)`` count as independent (Bartlett, Journal of the
+    Royal Statistical Society 1935), mostly far fewer than the covariance has dimensions. Its small
+    values come out too small then, and those of the depths doubly so, which are learnt from what it
+    said of them before. As usual (Ledoit, Wolf, Journal of Multivariate Analysis 2004) it is mixed
+    with a model of fewer parameters: all points move along the axes alike, ``A kron C``, with A how
+    much shapes move along each axis and C how points move together.
+    """
+    blocks = covariance.reshape(3, len(covariance) // 3, 3, -1)
+    of_axes, of_points = np.einsum("aibi->ab", blocks), np.einsum("aiaj->ij", blocks)
+    size = max(float(np.trace(of_axes)), np.finfo(float).tiny)
+    independent = 1.0 + frames * (1.0 - correlation**2) / (1.0 + correlation**2)
+    part = shrinkage / independent
+    mixed: NDArray[np.float64] = covariance + part * np.kron(of_axes, of_points) / size
+    return mixed / (1.0 + part)
 
 
 def _outer(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -729,15 +729,16 @@ def faded(value: float, limits: tuple[float, float]) -> float:
     return min(max((high - value) / (high - low), 0.0), 1.0)
 
 
-LIKELY = (0.55, 0.75)
+LIKELY = (0.6, 0.9)
 """Complexities between which the likely depths lose their part, unless the shapes are steady."""
 
 _ROUGHLY = 5.0  # times the tolerance, for the start of a refinement
 _LITTLE = 0.25  # part of the depths below which refining it is not worth the time
-_LIKELY_NOISE = 0.2  # part of the tracks' spread
+_LIKELY_NOISE = 0.4  # part of the tracks' spread
 _LIKELY_DIRECTIONS = 24
 _LIKELY_FLOOR = 0.0008
 _FLOOR_BY_NOISE = 0.07
+_LIKELY_SHRINKAGE = 0.07
 _LIKELY_TOLERANCE = 5e-4
 _LEAST_ROUNDS = 20
 _MOST_ROUNDS = 60
@@ -811,6 +812,7 @@ def with_likely_depth(
         lengths=lengths,
         adjustment=adjustment,
         floor=_LIKELY_FLOOR + _FLOOR_BY_NOISE * noise,
+        shrinkage=_LIKELY_SHRINKAGE,
         max_iterations=rounds,
         tolerance=_LIKELY_TOLERANCE,
         hook=hook,

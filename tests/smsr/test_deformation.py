@@ -13,6 +13,7 @@ from smsr.deformation import (
     Deformation,
     condition,
     extrapolated,
+    first_model,
     likely_shapes,
     log_likelihood,
     turning_force,
@@ -247,6 +248,70 @@ class TestAdjustment:
         # From the sixth round on, to the twelfth of twenty at most, or until all has settled.
         assert asked == [0] * steps
         assert spy.asked == 3
+
+
+class TestShrinkage:
+    def test_the_simpler_model_moves_all_points_along_the_axes_alike(self) -> None:
+        in_space = np.kron(np.diag([4.0, 2.0, 1.0]), np.array([[2.0, 1.0], [1.0, 1.0]]))
+        shapes = sample(Deformation(np.zeros(6), in_space, 0.0), 5000)
+        plain, shrunk = (
+            first_model(shapes, turning(5000, 4.0)[:, 2], 1e-9, shrinkage).covariance
+            for shrinkage in (0.0, 1e12)
+        )
+        # One where that is true, and a single product where it is not.
+        np.testing.assert_allclose(shrunk, plain, atol=0.05 * np.abs(plain).max())
+        by_axes = shrunk.reshape(3, 2, 3, 2).transpose(0, 2, 1, 3).reshape(9, 4)
+        assert np.linalg.matrix_rank(by_axes, tol=1e-8) == 1
+
+    def test_frames_that_are_alike_count_less(self) -> None:
+        """Beside one shape, T (1 - a^2) / (1 + a^2) of them, here with a of 0.9."""
+        parts = []
+        for frames in (10, 100):
+            shapes, axis = sample(model(3, 0.9), frames), turning(frames, 4.0)[:, 2]
+            models = [first_model(shapes, axis, 1e-9, each) for each in (0.0, 1e9, 0.2)]
+            plain, simple, mixed = (each.covariance for each in models)
+            change = simple - plain
+            part = ((mixed - plain) * change).sum() / (change**2).sum()
+            np.testing.assert_allclose(mixed, plain + part * change, atol=1e-6)
+            parts.append(part / (1.0 - part))
+        independent = [1.0 + frames * 0.19 / 1.81 for frames in (10, 100)]
+        np.testing.assert_allclose(parts, 0.2 / np.array(independent), rtol=1e-5)
+
+    def test_the_frame_of_the_object_does_not_matter(self) -> None:
+        shapes, rotations = sample(model(4, 0.9), 20), turning(20, 4.0)
+        turn = so3.exp(np.array([0.3, -0.5, 0.8]))
+        plain, turned = (
+            first_model(each, cameras[:, 2], 1e-9, 0.5)
+            for each, cameras in ((shapes, rotations), (turn @ shapes, rotations @ turn.T))
+        )
+        mixing = np.kron(turn, np.eye(4))
+        np.testing.assert_allclose(
+            turned.covariance, mixing @ plain.covariance @ mixing.T, atol=1e-12
+        )
+
+    def test_of_few_shapes_that_are_not_so_simple_less_is_wrong(self) -> None:
+        errors = []
+        for seed in range(3):
+            rng = np.random.default_rng(seed)
+            factor = rng.standard_normal((36, 36)) / np.arange(1, 37)
+            covariance = factor @ factor.T + 1e-6 * np.eye(36)
+            true = sample(Deformation(rng.standard_normal(36), covariance, 0.99), 100, seed)
+            rotations = turning(100, 4.0)
+            start = low_rank_shapes((rotations[:, :2] @ true).reshape(200, 12), rotations).shapes
+            found = (
+                likely_shapes(
+                    start,
+                    rotations,
+                    floor=0.001,
+                    max_iterations=60,
+                    tolerance=0.0,
+                    shrinkage=shrinkage,
+                ).shapes
+                for shrinkage in (0.0, 0.07)
+            )
+            errors.append([float(np.linalg.norm(S - true)) for S in found])
+        without, shrunk = np.exp(np.log(errors).mean(axis=0))
+        assert shrunk < 0.95 * without
 
 
 class TestLikelyShapes:
