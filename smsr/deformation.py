@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 _FIRST_CORRELATION = 0.9
 _MOST_CORRELATION = 0.9999
+_SPANNED = 1e-9  # variance by the largest one
+_OF_LOWER_QUARTILE = 0.25
 _FEWEST_ROUNDS = 9  # without lengths
 _FEWEST_MORE = 3  # with them
 _ROUNDS_WITHOUT_LENGTHS = 0.6  # of all, at most
@@ -143,7 +145,7 @@ def likely_shapes(
         Cameras completed by the viewing direction.
     floor : float
         Standard deviation in every direction at least, as a part of the root mean square over
-        frames and axes of the norm of a shape; more than 0.
+        frames and axes of the norm of a shape; more than 0, with shrinkage 1e-4 at least.
     max_iterations : int
         Most rounds, at least 1.
     tolerance : float
@@ -467,8 +469,8 @@ def _through_time(
 def _inverse(matrix: NDArray[np.float64], below: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the inverse of a symmetric positive definite matrix, near it where it is not.
 
-    By its Cholesky factor, which takes half the time of a general inverse and errs less. `below` is
-    true on and below the diagonal.
+    By its Cholesky factor, which takes half the time of a general inverse and is symmetric. `below`
+    is true on and below the diagonal.
     """
     factor, failed = dpotrf(matrix, lower=1, clean=0)
     if failed:
@@ -508,9 +510,9 @@ def learnt(
     variance : float
         See `least_variance`.
     shrinkage : float
-        Part of a simpler model in a covariance learnt from a single shape, as a multiple of what
-        the shape says. 0 where cameras are turned or judged one by one: they would be turned to
-        explain motion that only the simpler model knows of.
+        Weight of a simpler model beside a covariance that is learnt from one shape, see `_shrunk`.
+        0 where each camera turns freely and where cameras are compared by likelihood: they would be
+        turned to explain motion that only the simpler model knows of.
     keep_correlation : bool
         Leave the correlation as it was.
     """
@@ -548,19 +550,28 @@ def _shrunk(
 ) -> NDArray[np.float64]:
     """Return a covariance (3q, 3q) that is as unsure as one learnt from few shapes must be.
 
-    Of T frames about ``T (1 - a^2) / (1 + a^2)`` count as independent (Bartlett, Journal of the
-    Royal Statistical Society 1935), mostly far fewer than the covariance has dimensions. Its small
-    values come out too small then, and those of the depths doubly so, which are learnt from what it
-    said of them before. As usual (Ledoit, Wolf, Journal of Multivariate Analysis 2004) it is mixed
-    with a model of fewer parameters: all points move along the axes alike, ``A kron C``, with A how
-    much shapes move along each axis and C how points move together.
+    A model of fewer parameters is mixed in, as by Ledoit and Wolf (Journal of Multivariate Analysis
+    2004): all points move along the axes alike, ``A kron C``, with A how shapes move along the
+    axes and C how points move together. Its part is the less, the more shapes are independent,
+    ``T (1 - a^2) / (1 + a^2)`` (Bartlett, Journal of the Royal Statistical Society 1935) and one to
+    begin with. Were the process what it is taken for, all T frames would count; but real motion is
+    smoother, and the covariance is learnt from depths that it gave itself. Of few basis shapes the
+    model is wrong, as it moves where they do not. So its part stays below what the covariance has,
+    in units of the model, in most directions.
     """
     blocks = covariance.reshape(3, len(covariance) // 3, 3, -1)
     of_axes, of_points = np.einsum("aibi->ab", blocks), np.einsum("aiaj->ij", blocks)
     size = max(float(np.trace(of_axes)), np.finfo(float).tiny)
+    along, axes = np.linalg.eigh(of_axes / size)
+    together, points = np.linalg.eigh(of_points)
+    variances = np.maximum(np.kron(along, together), 0.0)
+    directions = np.kron(axes, points)
+    spanned = variances > _SPANNED * variances[-1]
+    whitened = directions[:, spanned] / np.sqrt(variances[spanned])
+    parts = np.linalg.eigvalsh(whitened.T @ covariance @ whitened)
     independent = 1.0 + frames * (1.0 - correlation**2) / (1.0 + correlation**2)
-    part = shrinkage / independent
-    mixed: NDArray[np.float64] = covariance + part * np.kron(of_axes, of_points) / size
+    part = min(shrinkage / independent, _OF_LOWER_QUARTILE * float(np.quantile(parts, 0.25)))
+    mixed: NDArray[np.float64] = covariance + part * np.kron(of_axes / size, of_points)
     return mixed / (1.0 + part)
 
 

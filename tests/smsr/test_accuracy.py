@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.data
 
 SPARSE = {
-    "drink": 0.006,
-    "pickup": 0.025,
-    "stretch": 0.033,
-    "yoga": 0.022,
-    "dance": 0.0988,
+    "drink": 0.0055,
+    "pickup": 0.02,
+    "stretch": 0.032,
+    "yoga": 0.018,
+    "dance": 0.08,
     "dinosaur": 0.235,
 }
 DENSE = {"facecap": 0.015, "samba": 0.10}

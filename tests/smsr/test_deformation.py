@@ -251,31 +251,35 @@ class TestAdjustment:
 
 
 class TestShrinkage:
-    def test_the_simpler_model_moves_all_points_along_the_axes_alike(self) -> None:
-        in_space = np.kron(np.diag([4.0, 2.0, 1.0]), np.array([[2.0, 1.0], [1.0, 1.0]]))
-        shapes = sample(Deformation(np.zeros(6), in_space, 0.0), 5000)
-        plain, shrunk = (
-            first_model(shapes, turning(5000, 4.0)[:, 2], 1e-9, shrinkage).covariance
-            for shrinkage in (0.0, 1e12)
+    @staticmethod
+    def part(shapes: Array, shrinkage: float) -> float:
+        """Return that of the simpler model, beside one of the plain covariance."""
+        frames, _, points = shapes.shape
+        axis = turning(frames, 4.0)[:, 2]
+        plain, mixed = (
+            first_model(shapes, axis, 1e-12, each).covariance for each in (0.0, shrinkage)
         )
-        # One where that is true, and a single product where it is not.
-        np.testing.assert_allclose(shrunk, plain, atol=0.05 * np.abs(plain).max())
-        by_axes = shrunk.reshape(3, 2, 3, 2).transpose(0, 2, 1, 3).reshape(9, 4)
-        assert np.linalg.matrix_rank(by_axes, tol=1e-8) == 1
+        blocks = plain.reshape(3, points, 3, points)
+        of_axes = sum(blocks[:, i, :, i] for i in range(points))
+        of_points = sum(blocks[k, :, k] for k in range(3))
+        simpler = np.kron(of_axes, of_points) / np.trace(plain)
+        both = np.stack([plain.ravel(), simpler.ravel()], axis=1)
+        (rest, part), *_ = np.linalg.lstsq(both, mixed.ravel(), rcond=None)
+        np.testing.assert_allclose(mixed, rest * plain + part * simpler, atol=1e-9)
+        assert rest + part == pytest.approx(1.0)
+        return float(part / rest)
 
-    def test_frames_that_are_alike_count_less(self) -> None:
+    @pytest.mark.parametrize("frames", [10, 100])
+    def test_frames_that_are_alike_count_less(self, frames: int) -> None:
         """Beside one shape, T (1 - a^2) / (1 + a^2) of them, here with a of 0.9."""
-        parts = []
-        for frames in (10, 100):
-            shapes, axis = sample(model(3, 0.9), frames), turning(frames, 4.0)[:, 2]
-            models = [first_model(shapes, axis, 1e-9, each) for each in (0.0, 1e9, 0.2)]
-            plain, simple, mixed = (each.covariance for each in models)
-            change = simple - plain
-            part = ((mixed - plain) * change).sum() / (change**2).sum()
-            np.testing.assert_allclose(mixed, plain + part * change, atol=1e-6)
-            parts.append(part / (1.0 - part))
-        independent = [1.0 + frames * 0.19 / 1.81 for frames in (10, 100)]
-        np.testing.assert_allclose(parts, 0.2 / np.array(independent), rtol=1e-5)
+        independent = 1.0 + frames * 0.19 / 1.81
+        found = self.part(sample(model(3, 0.9), frames), 0.005)
+        assert found == pytest.approx(0.005 / independent, rel=1e-4)
+
+    def test_shapes_that_are_simple_are_left_alone(self) -> None:
+        many, few = (sample(model(6, 0.9, rank=rank), 60) for rank in (18, 4))
+        assert self.part(many, 0.2) > 0.01
+        assert self.part(few, 0.2) < 1e-4
 
     def test_the_frame_of_the_object_does_not_matter(self) -> None:
         shapes, rotations = sample(model(4, 0.9), 20), turning(20, 4.0)

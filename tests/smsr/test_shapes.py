@@ -370,6 +370,11 @@ class TestLikelyDepth:
         self.moved(noise=0.05)
         assert floors[1] > 2.0 * floors[0]
 
+    def test_the_covariance_is_shrunk(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        shrunk = self.moved()
+        monkeypatch.setattr("smsr.shapes._LIKELY_SHRINKAGE", 0.0)
+        assert abs(shrunk - self.moved()) > 1e-4 * shrunk
+
     @pytest.mark.parametrize(("share", "refined"), [(0.1, 1), (0.5, 2), (0.9, 1), (1.0, 1)])
     def test_depths_of_little_weight_are_not_refined(self, share: float, refined: int) -> None:
         W, rotations, _ = sequence(modes=4)
