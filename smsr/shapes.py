@@ -51,8 +51,8 @@ class ShapeEstimate:
     flicker : float
         See `flicker`; 0 where it was not measured.
     steadiness : float
-        Of the likely shapes that take part in these, see `steadiness`, as far as it counted; 0
-        where it was not measured.
+        Of the likely shapes that take part in these, see `steadiness`, as far as noise lets it
+        count; 0 where it was not measured.
     rotations : ndarray of shape (T, 3, 3), optional
         The cameras, where they were adjusted with the shapes.
     """
@@ -829,7 +829,7 @@ def with_likely_depth(
     return dataclasses.replace(
         estimate,
         shapes=shapes + part * (others - some) @ directions.T,
-        steadiness=steady,
+        steadiness=steady * _trust(noise),
         rotations=adjusted,
         iterations=estimate.iterations + likely.iterations,
         reason=f"{estimate.reason}; {part:.0%} of depths as a Gaussian deformation has them, "
@@ -909,9 +909,8 @@ def with_deep_shapes(
     noise : float
         As a part of the tracks' spread: the more there was, the less does simplicity say.
     """
-    trust = _trust(noise)
-    part = max(faded(deep.complexity, _DEEP), deep.steadiness) * trust
-    doubt = faded(spread_of_views(rotations), _FEW_VIEWS) * trust
+    part = max(faded(deep.complexity, _DEEP) * _trust(noise), deep.steadiness)
+    doubt = faded(spread_of_views(rotations), _FEW_VIEWS)
     keep = 1.0 + doubt * min(deep.steadiness, 0.0)
     if part == 0.0 and keep == 1.0:
         return estimate
@@ -930,7 +929,7 @@ def with_deep_shapes(
     return dataclasses.replace(
         estimate,
         shapes=estimate.shapes + axis[:, :, None] * change[:, None],
-        steadiness=deep.steadiness * trust,
+        steadiness=deep.steadiness,
         iterations=estimate.iterations + deep.iterations,
         converged=estimate.converged and deep.converged,
         reason=reason,

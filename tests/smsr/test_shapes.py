@@ -313,6 +313,7 @@ class TestLikelyDepth:
         assert with_likely_depth(doubtful, rotations) is doubtful
         likely = with_likely_depth(doubtful, rotations, doubtful=True)
         assert likely.steadiness == 1.0
+        assert with_likely_depth(doubtful, rotations, 0.2, doubtful=True).steadiness == 0.0
         assert relative_error(likely.shapes, shapes) < 0.5 * relative_error(found.shapes, shapes)
 
     def test_it_counts_less_where_the_motion_flickered(self) -> None:
