@@ -60,7 +60,7 @@ def run_worker(settings: Settings, *, burst: bool = False) -> None:
     """
     if settings.redis_url is None:
         raise ValueError("the settings name no Redis server")
-    stop = _EarlyStop()
+    stop = _Stop()
     signal.signal(signal.SIGTERM, stop)
     name = _worker_name()
     root = settings.scratch
@@ -77,10 +77,11 @@ def run_worker(settings: Settings, *, burst: bool = False) -> None:
             keeper.stop()
 
 
-class _EarlyStop:
-    """Handler of SIGTERM until RQ has its own: a worker that hardly started leaves nothing behind.
+class _Stop:
+    """Handler of SIGTERM that ends the process and leaves nothing behind.
 
-    It is remembered, as some library that is being imported may swallow the SystemExit.
+    Of a worker until RQ has its own, and of a keeper. It is remembered, as a finaliser or some
+    library that is being imported may swallow the SystemExit.
     """
 
     def __init__(self) -> None:
@@ -91,7 +92,7 @@ class _EarlyStop:
         sys.exit()
 
 
-def _work(settings: Settings, name: str, keeper: _Keeper, stop: _EarlyStop, *, burst: bool) -> None:
+def _work(settings: Settings, name: str, keeper: _Keeper, stop: _Stop, *, burst: bool) -> None:
     """Work, and begin anew when the connection to Redis broke."""
     failures = 0
     while not stop.received:
@@ -165,12 +166,13 @@ def _keep_order(settings: Settings, name: str, scratch: Path, parent: int) -> No
     """Do the maintenance until the worker ends."""
     die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    stop = _Stop()
+    signal.signal(signal.SIGTERM, stop)
     queue = JobQueue(settings)
     maintenance = Maintenance(queue)
     swept = time.monotonic()
     try:
-        while os.getppid() == parent:
+        while os.getppid() == parent and not stop.received:
             with contextlib.suppress(RedisError):  # the maintenance says so, too
                 queue.records.sign_of_life(name)
             maintenance.run_once()

@@ -29,6 +29,28 @@ if os.fork() == 0:
 os.wait()
 """
 
+SWALLOWED = """
+import os, signal, time
+from worker import main
+from worker.settings import Settings
+
+class Finalised:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+
+class Maintenance(main.Maintenance):
+    def run_once(self):
+        Finalised()
+
+main.Maintenance = Maintenance
+keeper = main._Keeper(Settings(), "worker", Settings().scratch)
+keeper.ensure()
+keeper._process.join(10)
+print(keeper._process.exitcode)
+keeper._process.kill()
+"""
+
 
 def test_a_worker_that_ends_when_the_queue_is_empty(
     queue: JobQueue, settings: Settings, submit: Submitter
@@ -58,6 +80,19 @@ def test_a_worker_that_is_stopped_while_it_starts(settings: Settings, delay: flo
     finally:
         process.kill()
     assert list(settings.scratch.iterdir()) == []
+
+
+def test_a_keeper_ends_though_a_finaliser_swallows_its_exit(settings: Settings) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SWALLOWED],
+        env=clean_environment(**settings.to_environ()),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert "SystemExit" in done.stderr
+    assert done.stdout.strip() == "0"
 
 
 def state(record: JobRecord | None) -> str | None:
