@@ -561,7 +561,9 @@ def _shrunk(
     """
     blocks = covariance.reshape(3, len(covariance) // 3, 3, -1)
     of_axes, of_points = np.einsum("aibi->ab", blocks), np.einsum("aiaj->ij", blocks)
-    size = max(float(np.trace(of_axes)), np.finfo(float).tiny)
+    size = float(np.trace(of_axes))
+    if size == 0.0:  # nothing moves
+        return covariance
     along, axes = np.linalg.eigh(of_axes / size)
     together, points = np.linalg.eigh(of_points)
     variances = np.maximum(np.kron(along, together), 0.0)

@@ -281,6 +281,11 @@ class TestShrinkage:
         assert self.part(many, 0.2) > 0.01
         assert self.part(few, 0.2) < 1e-4
 
+    def test_shapes_at_rest_stay_so(self) -> None:
+        still = np.zeros((20, 3, 4))
+        found = first_model(still, turning(20, 4.0)[:, 2], 1e-9, 0.07)
+        np.testing.assert_array_equal(found.covariance, 1e-9 * np.eye(12))
+
     def test_the_frame_of_the_object_does_not_matter(self) -> None:
         shapes, rotations = sample(model(4, 0.9), 20), turning(20, 4.0)
         turn = so3.exp(np.array([0.3, -0.5, 0.8]))
