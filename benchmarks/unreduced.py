@@ -24,7 +24,7 @@ from smsr.lifting import exact_lifting
 from smsr.measurements import as_source
 from smsr.rotations import complete
 from smsr.rowspace import factorise, map_back
-from smsr.shapes import published_shapes
+from smsr.shapes.paper import published_shapes
 from smsr.synthetic import make_low_rank
 
 if TYPE_CHECKING:

@@ -170,9 +170,9 @@ def depth_cautions(complexity: float, steadiness: float) -> list[Caution]:
     Parameters
     ----------
     complexity : float
-        See `smsr.shapes.DepthProblem.complexity`.
+        See `smsr.shapes.problem.DepthProblem.complexity`.
     steadiness : float
-        See `smsr.shapes.steadiness`.
+        See `smsr.shapes.credibility.steadiness`.
     """
     if complexity <= _WEAK_DEPTH or steadiness > _STEADY_ENOUGH:
         return []
@@ -194,7 +194,7 @@ def size_cautions(growth: float, complexity: float) -> list[Caution]:
     growth : float
         See `smsr.scales.growth`.
     complexity : float
-        See `smsr.shapes.DepthProblem.complexity`: where depth is a guess, so are distances.
+        See `smsr.shapes.problem.DepthProblem.complexity`: where depth is a guess, so are distances.
     """
     if growth <= (_GROWING if complexity <= _WEAK_DEPTH else _GROWING_IN_DOUBT):
         return []

@@ -29,7 +29,6 @@ from smsr.cautions import (
 )
 from smsr.completion import completed
 from smsr.errors import Cancelled
-from smsr.lengths import chosen_points
 from smsr.lifting import denoised_lifting, exact_lifting, smoothed_lifting
 from smsr.measurements import as_source
 from smsr.options import Options, parse, resolve
@@ -39,7 +38,9 @@ from smsr.result import Diagnostics, Reconstruction, StageReport
 from smsr.rotations import angles_between
 from smsr.rowspace import factorise, map_back
 from smsr.scales import divided, growth, noise_gain, varying_scales
-from smsr.shapes import basis_size_of, estimate_shapes
+from smsr.shapes.estimate import basis_size_of
+from smsr.shapes.lengths import chosen_points
+from smsr.shapes.selection import estimate_shapes
 from smsr.streaming import one_blas_thread
 from smsr.trajectories import smooth_trajectories
 
@@ -57,7 +58,7 @@ if TYPE_CHECKING:
     from smsr.result import Caution
     from smsr.rowspace import RowSpace
     from smsr.scales import ScaleEstimate
-    from smsr.shapes import ShapeEstimate
+    from smsr.shapes.estimate import ShapeEstimate
     from smsr.trajectories import SmoothMotion
 
 _SHARES = {

@@ -28,9 +28,9 @@ from smsr.cameras.constraints import (
 )
 from smsr.cameras.estimate import corrective_matrix, scaled_motion, usable_rank
 from smsr.cameras.relaxed import relaxed_factor
-from smsr.lengths import chosen_points
 from smsr.progress import ignore, part_of
 from smsr.reduction import Reduction
+from smsr.shapes.lengths import chosen_points
 
 if TYPE_CHECKING:
     from collections.abc import Callable

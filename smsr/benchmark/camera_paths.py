@@ -32,7 +32,7 @@ from smsr.pipeline import reconstruct
 from smsr.reduction import Reduction
 from smsr.rotations import complete
 from smsr.rowspace import factorise
-from smsr.shapes import estimate_shapes
+from smsr.shapes.selection import estimate_shapes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

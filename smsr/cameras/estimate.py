@@ -53,9 +53,9 @@ class CameraEstimate:
     simpler_share : float
         How much of the depths that they see is to be taken, 0 to 1.
     adjustable : ndarray of shape (k, T, 3), optional
-        What of a path is not sure, see `smsr.adjustment`: rotation vectors in the frame of each
-        camera, by which it turns where the velocity changes by one radian over the range of the
-        turn. The middle camera stays.
+        What of a path is not sure, see `smsr.shapes.adjustment`: rotation vectors in the
+        frame of each camera, by which it turns where the velocity changes by one radian over the
+        range of the turn. The middle camera stays.
     """
 
     rotations: NDArray[np.float64]

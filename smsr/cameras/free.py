@@ -123,8 +123,8 @@ def free_cameras(
         as if the object had been seen from the front once, and ``frontal_views``, how often it
         is, instead of the second. Of a camera that shakes ``disagreement`` is the angle to where
         another start leads, if that is nearly as likely, and there are ``relaxed_complexity``,
-        ``steadiness``, see `smsr.shapes.steadiness`, ``relaxed_steadiness`` and, where the mean
-        shape is flat, ``frontal_views``.
+        ``steadiness``, see `smsr.shapes.credibility.steadiness`, ``relaxed_steadiness`` and, where
+        the mean shape is flat, ``frontal_views``.
     """
     most = max(1, len(values) // 3)
     heavy = min(noise / _NOISY, 1.0) ** 2

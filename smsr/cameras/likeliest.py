@@ -3,11 +3,11 @@
 The simplest shapes do not tell of a camera that turns by some degrees only, and with a little noise
 they lead it astray. If it shakes, as one that is held in the hand, the tracks tell all the same: no
 object moves to and fro from frame to frame as its image does then. The Gaussian model of the
-deformation (`smsr.deformation`), in which consecutive shapes are alike, puts a number on it, and
-the cameras follow its gradient together with the depths. Relaxed cameras that turn slowly must not
-be left to it: what the object does as slowly is then as likely the camera's. They may where noise
-has put them off by more than that, and so may those of a flat mean shape, off by what the object
-bends.
+deformation (`smsr.shapes.deformation`), in which consecutive shapes are alike, puts a number on it,
+and the cameras follow its gradient together with the depths. Relaxed cameras that turn slowly must
+not be left to it: what the object does as slowly is then as likely the camera's. They may where
+noise has put them off by more than that, and so may those of a flat mean shape, off by what the
+object bends.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from scipy.linalg import solveh_banded
 from smsr import rotations as so3
 from smsr.cameras.estimate import STILL
 from smsr.cameras.simplicity import DIRECTIONS, complexity, flatness, roughly_solved
-from smsr.deformation import (
+from smsr.progress import ignore, part_of
+from smsr.shapes.credibility import steadiness
+from smsr.shapes.deformation import (
     as_seen,
     condition,
     first_model,
@@ -33,8 +35,6 @@ from smsr.deformation import (
     log_likelihood,
     turning_force,
 )
-from smsr.progress import ignore, part_of
-from smsr.shapes import steadiness
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smsr.cameras.estimate import CameraEstimate
-    from smsr.deformation import Deformation
     from smsr.progress import StageHook
+    from smsr.shapes.deformation import Deformation
 
 FROM_FAR = ((0.03, 100), (0.01, 30), (0.005, 20), (0.0025, 20))
 """Floors of the model, and rounds with each, that lead from cameras which may be off by tens of
@@ -90,8 +90,8 @@ def likeliest_cameras(
     rotations : ndarray of shape (T, 3, 3)
         Cameras to start from, completed by the viewing direction.
     stages : sequence of pairs
-        Floor of the model, see `smsr.deformation.likely_shapes`, and number of rounds, which is
-        reduced for more than 1000 frames.
+        Floor of the model, see `smsr.shapes.deformation.likely_shapes`, and number of rounds,
+        which is reduced for more than 1000 frames.
     hook : callable
         See `smsr.progress.StageHook`.
     lengthened : float
@@ -202,7 +202,7 @@ class ShakenCameras:
     flatness : float
         Of the mean shape, see `smsr.cameras.simplicity.flatness`.
     steadiness : float
-        Of their shapes, see `smsr.shapes.steadiness`,
+        Of their shapes, see `smsr.shapes.credibility.steadiness`,
     former_steadiness : float
         and of those of the cameras that were judged.
     """

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from smsr import rotations as so3
-from smsr.shapes import faded
+from smsr.shapes.credibility import faded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -20,7 +20,8 @@ from smsr.cameras.rigid import looks_rigid, rigid_cameras
 from smsr.cameras.simplicity import every_frame
 from smsr.cameras.trial import Trial
 from smsr.progress import ignore, part_of
-from smsr.shapes import by_turn_speed, faded
+from smsr.shapes.credibility import faded
+from smsr.shapes.low_rank import by_turn_speed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smsr.shapes import DepthProblem
+from smsr.shapes.problem import DepthProblem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -24,7 +24,7 @@ from smsr.cameras.switched import fit_switched_turn
 from smsr.cameras.turn import refine_velocity, with_shake
 from smsr.cameras.uniform import fit_uniform_turn
 from smsr.progress import ignore
-from smsr.shapes import DepthProblem
+from smsr.shapes.problem import DepthProblem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from smsr import rotations as so3
 from smsr.progress import ignore
-from smsr.shapes import DepthProblem
+from smsr.shapes.problem import DepthProblem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from smsr import rotations as so3
-from smsr.adjustment import SETTLED, Adjustment
+from smsr.shapes.adjustment import SETTLED, Adjustment
 from tests.limbs import turning
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import pytest
 from scipy.linalg import block_diag
 
 from smsr import rotations as so3
-from smsr.adjustment import Adjustment
-from smsr.deformation import (
+from smsr.shapes.adjustment import Adjustment
+from smsr.shapes.deformation import (
     Deformation,
     condition,
     extrapolated,
@@ -18,8 +18,8 @@ from smsr.deformation import (
     log_likelihood,
     turning_force,
 )
-from smsr.lengths import Evidence, Lengths
-from smsr.shapes import low_rank_shapes
+from smsr.shapes.lengths import Evidence, Lengths
+from smsr.shapes.low_rank import low_rank_shapes
 from tests.limbs import turning
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smsr.deformation import likely_shapes
-from smsr.lengths import MOST_POINTS, Lengths, chosen_points
-from smsr.shapes import low_rank_shapes
+from smsr.shapes.deformation import likely_shapes
+from smsr.shapes.lengths import MOST_POINTS, Lengths, chosen_points
+from smsr.shapes.low_rank import low_rank_shapes
 from tests.limbs import limbs, turning
 
 if TYPE_CHECKING:

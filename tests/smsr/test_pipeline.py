@@ -19,7 +19,8 @@ from smsr.errors import Cancelled, InvalidOption, UnknownOption
 from smsr.options import Options, resolve
 from smsr.progress import STAGES
 from smsr.rotations import complete
-from smsr.shapes import estimate_shapes, planar_shapes
+from smsr.shapes.estimate import planar_shapes
+from smsr.shapes.selection import estimate_shapes
 from smsr.synthetic import make_example, make_low_rank
 from tests.limbs import limbs, turning
 from tests.shaken import shaken

@@ -7,28 +7,23 @@ import numpy as np
 import pytest
 
 from smsr import rotations as so3
-from smsr.deformation import LikelyShapes, likely_shapes
-from smsr.lengths import Lengths, chosen_points
 from smsr.options import Options
-from smsr.shapes import (
+from smsr.shapes.credibility import (
     DOUBTFUL,
-    DepthProblem,
-    ShapeEstimate,
-    basis_size_of,
     credible_depth,
-    estimate_shapes,
-    flicker,
-    low_rank_shapes,
-    motion_scale,
-    planar_shapes,
-    published_shapes,
-    reweighted_shapes,
-    rigid_shapes,
     steadiness,
     with_deep_shapes,
-    with_likely_depth,
     with_mean_depth,
 )
+from smsr.shapes.deformation import LikelyShapes, likely_shapes
+from smsr.shapes.estimate import ShapeEstimate, basis_size_of, planar_shapes
+from smsr.shapes.lengths import Lengths, chosen_points
+from smsr.shapes.likely import with_likely_depth
+from smsr.shapes.low_rank import flicker, low_rank_shapes, motion_scale, reweighted_shapes
+from smsr.shapes.paper import published_shapes
+from smsr.shapes.problem import DepthProblem
+from smsr.shapes.rigid import rigid_shapes
+from smsr.shapes.selection import estimate_shapes
 from tests.limbs import limbs, turning
 from tests.shaken import shaken
 
@@ -340,7 +335,7 @@ class TestLikelyDepth:
             told.append((noise, weight, shapes))
             return Lengths(shapes, *args, noise=noise, weight=weight)
 
-        monkeypatch.setattr("smsr.shapes.Lengths", spy)
+        monkeypatch.setattr("smsr.shapes.likely.Lengths", spy)
         self.moved(noise=0.05)
         self.moved(flicker=1.5)
         assert [each[:2] for each in told] == [(0.05, 1.0), (0.0, 2.5)]
@@ -366,14 +361,14 @@ class TestLikelyDepth:
             floors.append(floor)
             return likely_shapes(*args, floor=floor, **rest)
 
-        monkeypatch.setattr("smsr.shapes.likely_shapes", spy)
+        monkeypatch.setattr("smsr.shapes.likely.likely_shapes", spy)
         self.moved()
         self.moved(noise=0.05)
         assert floors[1] > 2.0 * floors[0]
 
     def test_the_covariance_is_shrunk(self, monkeypatch: pytest.MonkeyPatch) -> None:
         shrunk = self.moved()
-        monkeypatch.setattr("smsr.shapes._LIKELY_SHRINKAGE", 0.0)
+        monkeypatch.setattr("smsr.shapes.likely._SHRINKAGE", 0.0)
         assert abs(shrunk - self.moved()) > 1e-4 * shrunk
 
     @pytest.mark.parametrize(("share", "refined"), [(0.1, 1), (0.5, 2), (0.9, 1), (1.0, 1)])

@@ -23,16 +23,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from smsr.adjustment import SETTLED
 from smsr.progress import ignore
 from smsr.rotations import depths_along
+from smsr.shapes.adjustment import SETTLED
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smsr.adjustment import Adjustment
-    from smsr.lengths import Evidence, Lengths
     from smsr.progress import StageHook
+    from smsr.shapes.adjustment import Adjustment
+    from smsr.shapes.lengths import Evidence, Lengths
 
 _FIRST_CORRELATION = 0.9
 _MOST_CORRELATION = 0.9999
@@ -110,7 +110,7 @@ class LikelyShapes:
     change : float
         Of the depths in the last round, as a part of the deformation.
     support : float
-        See `smsr.lengths.Evidence`; 0 without lengths.
+        See `smsr.shapes.lengths.Evidence`; 0 without lengths.
     """
 
     shapes: NDArray[np.float64]
