@@ -18,7 +18,8 @@ from smsr.shapes.credibility import faded
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_ROUNDS = 60
+_MOST_ROUNDS = 60
+_SETTLED = 1e-4  # change of the mean shape in a round, by its size
 _NEAR = 0.02  # of the object's size; what moves less is at rest
 _QUIET_PART = 0.1  # of the points
 _RESTING = (0.16, 0.22)
@@ -62,8 +63,9 @@ def resting_frame(shapes: NDArray[np.float64]) -> Rest:
     near = max((_NEAR * size) ** 2, np.finfo(float).tiny)
     turned = shapes
     weights = np.ones((len(shapes), 1, shapes.shape[2]))
-    for _ in range(_ROUNDS):
-        mean = (weights * turned).sum(axis=0) / weights.sum(axis=0)
+    mean = np.zeros_like(shapes[0])
+    for _ in range(_MOST_ROUNDS):
+        before, mean = mean, (weights * turned).sum(axis=0) / weights.sum(axis=0)
         total = weights.sum(axis=2, keepdims=True)
         centre = (weights * shapes).sum(axis=2, keepdims=True) / total
         centre_of_mean = (weights * mean).sum(axis=2, keepdims=True) / total
@@ -74,6 +76,8 @@ def resting_frame(shapes: NDArray[np.float64]) -> Rest:
         roots = np.sqrt(squares + near)
         weights = 1.0 / (roots * np.sqrt(roots))  # distance^(1/2 - 2), by roots many times faster
         weights /= weights.mean()
+        if np.linalg.norm(mean - before) <= _SETTLED * np.linalg.norm(mean):
+            break
     spread = np.linalg.svd(mean - mean.mean(axis=1, keepdims=True), compute_uv=False)
     if spread[1] <= _LINE * spread[0]:
         return Rest(turns, 1.0)
