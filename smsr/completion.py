@@ -563,7 +563,13 @@ def _ranks(highest: int) -> Iterator[int]:
 
 
 def _grow_to_best_rank(fit: _Fit, held: NDArray[np.bool_], highest: int) -> bool:
-    """Give the fit the rank that predicts held-out positions best; return whether to bridge."""
+    """Give the fit the rank that predicts held-out positions best; return whether to bridge.
+
+    Of the few positions of a small matrix none can be spared: then it is the lowest rank.
+    """
+    if not held.any():
+        fit.grow(min(3, highest))
+        return False
     tried: list[tuple[float, bool, NDArray[np.float64], NDArray[np.float64]]] = []
     best, best_at = np.inf, 0
     for index, rank in enumerate(_ranks(highest)):

@@ -211,6 +211,35 @@ class TestGrossErrors:
         assert gaps.rejected == 0
 
 
+class TestSmall:
+    """Of few positions none can be spared to choose the rank by."""
+
+    @pytest.mark.parametrize("points", [4, 5, 10, 12, 15])
+    @pytest.mark.parametrize("frames", [3, 4, 6])
+    def test_matrices_are_looked_through(self, frames: int, points: int) -> None:
+        example = make_low_rank(frames, points, 1, seed=points)
+        result = smsr.reconstruct(example.measurements, outliers="reject")
+        seen = result.cameras @ result.shapes.transpose(0, 2, 1) + result.translations[:, :, None]
+        rejected = result.diagnostics.rejected * frames * points
+        error = np.linalg.norm(seen - example.measurements.reshape(frames, 2, points), axis=1)
+        assert np.count_nonzero(error > 1e-6) <= rejected + 0.5
+
+    @pytest.mark.parametrize(("frames", "points"), [(4, 10), (5, 11), (6, 10), (36, 5)])
+    def test_a_gap_is_filled(self, frames: int, points: int) -> None:
+        measurements = make_low_rank(frames, points, 1, seed=0).measurements
+        seen = np.ones((frames, points), dtype=bool)
+        if points == 5:  # the fewest that a frame needs are left
+            seen[np.arange(frames), np.arange(frames) % points] = False
+        else:
+            seen[0, 1] = False
+        filled = fill(measurements, visibility=seen).reshape(frames, 2, points)
+        true = measurements.reshape(frames, 2, points)
+        np.testing.assert_array_equal(
+            filled.transpose(0, 2, 1)[seen], true.transpose(0, 2, 1)[seen]
+        )
+        assert np.abs(filled - true).max() < np.ptp(true)
+
+
 class TestReconstruction:
     def test_gaps_and_errors_hardly_change_the_shapes(self) -> None:
         example = make_low_rank(FRAMES, POINTS, 1, seed=3)
