@@ -1,8 +1,8 @@
 """The .npz format: a zip of .npy files. Stored members are mapped, deflated ones inflated.
 
 Sizes in a zip directory can lie, so an array's size is taken from its own .npy header, and no more
-than that many bytes are ever inflated. A member's checksum is verified where it is inflated; a map
-is not read, so there it is not. Layout of a zip: PKWARE's APPNOTE.TXT.
+than that many bytes are ever inflated. A member's checksum is verified, before it is mapped, too:
+the solver would take damaged bytes for tracks. Layout of a zip: PKWARE's APPNOTE.TXT.
 """
 
 from __future__ import annotations
@@ -151,7 +151,9 @@ def _find(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Stored
 
     def read() -> NDArray[Any]:
         if info.compress_type == zipfile.ZIP_STORED:
-            return map_array(path, header, _data_offset(path, info))
+            offset = _data_offset(path, info)
+            _check_sum(path, info, offset)
+            return map_array(path, header, offset)
         return _inflate(archive, info, header)
 
     return StoredArray(name, header.shape, header.dtype, read, header.problem)
@@ -184,6 +186,21 @@ def _data_offset(path: Path, info: zipfile.ZipInfo) -> int:
         if signature != b"PK\x03\x04" or offset + info.file_size > file.seek(0, io.SEEK_END):
             raise UnreadableFile("The .npz file is truncated or its directory is wrong.")
     return offset
+
+
+def _check_sum(path: Path, info: zipfile.ZipInfo, offset: int) -> None:
+    """Refuse a stored member whose bytes have not the checksum of the directory (CRC-32)."""
+    crc, left = 0, info.file_size
+    with path.open("rb") as file:
+        file.seek(offset)
+        while left > 0 and (block := file.read(min(left, _BLOCK))):
+            crc = zlib.crc32(block, crc)
+            left -= len(block)
+    if left > 0 or crc != info.CRC:
+        raise UnreadableFile(
+            f"The .npz file is damaged: the bytes of {info.filename} do not have the checksum that "
+            "was written with them. Make or send it anew."
+        )
 
 
 def _inflate(archive: zipfile.ZipFile, info: zipfile.ZipInfo, header: NpyHeader) -> NDArray[Any]:

@@ -223,3 +223,14 @@ def test_a_damaged_array_of_another_role_does_no_harm(tmp_path: Path) -> None:
     data[start : start + 40] = b"\xff" * 40
     path.write_bytes(data)
     np.testing.assert_array_equal(open_array(path), W)
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_one_wrong_byte_is_noticed(tmp_path: Path, save: Callable[..., Any]) -> None:
+    path = tmp_path / "damaged.npz"
+    save(path, W=W)
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") // 2] ^= 0x40
+    path.write_bytes(data)
+    with pytest.raises(UnreadableFile, match="damaged"):
+        open_array(path)
