@@ -170,7 +170,7 @@ def relaxed_scales(reduction: Reduction, hook: StageHook = ignore) -> NDArray[np
         reduction.left, reduction.values, usable_rank(reduction.values, 3 * _BASIS_SIZE)
     )
     mean, frames = mean_square_length(motion), len(motion) // 2
-    equal = orthonormality_form(motion, unit_scale=False)
+    equal = orthonormality_form(motion, rows="equal")
     form = OrthonormalityForm(
         equal.hessian + frames * np.outer(mean, mean), frames * mean, float(frames)
     )

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -117,22 +117,28 @@ def mean_square_length(motion: NDArray[np.float64]) -> NDArray[np.float64]:
 _FRAMES_AT_ONCE = 512
 
 
-def orthonormality_form(motion: NDArray[np.float64], *, unit_scale: bool) -> OrthonormalityForm:
+Rows: TypeAlias = Literal["unit", "equal", "published"]
+"""What is asked of the two rows of a camera, see `orthonormality_form`."""
+
+
+def orthonormality_form(motion: NDArray[np.float64], *, rows: Rows) -> OrthonormalityForm:
     """Gather the orthonormality constraints of all frames.
 
     Parameters
     ----------
     motion : ndarray of shape (2T, n)
         M', the scaled left singular vectors of the measurements.
-    unit_scale : bool
-        True asks for rows of unit length, ``m_u F m_u^T = m_v F m_v^T = 1``: one and the same
-        shape coefficient in every frame. False asks for rows of equal length only, as the paper
-        does (Eq. 8), and gives a homogeneous form.
+    rows : {"unit", "equal", "published"}
+        'unit' asks for unit length, ``m_u F m_u^T = m_v F m_v^T = 1``: one and the same shape
+        coefficient in every frame. 'equal' asks for equal length only (paper, Eq. 8), and gives a
+        homogeneous form. So does 'published', where a difference of the lengths counts twice as
+        much beside the angle: it depends on how the image is rotated.
 
     Returns
     -------
     OrthonormalityForm
-        With the cross constraint counted twice, as the entries (u, v) and (v, u) of a Gram matrix.
+        The squared distance of the Gram matrix of each frame from the identity, or from the nearest
+        multiple of it.
     """
     n = motion.shape[1]
     p = n * (n + 1) // 2
@@ -142,12 +148,13 @@ def orthonormality_form(motion: NDArray[np.float64], *, unit_scale: bool) -> Ort
     for first in range(0, len(motion), 2 * _FRAMES_AT_ONCE):
         uu, vv, uv = frame_products(motion[first : first + 2 * _FRAMES_AT_ONCE])
         hessian += 2.0 * uv.T @ uv
-        if unit_scale:
+        if rows == "unit":
             hessian += uu.T @ uu + vv.T @ vv
             linear += uu.sum(axis=0) + vv.sum(axis=0)
             constant += 2.0 * len(uu)
         else:
-            hessian += (uu - vv).T @ (uu - vv)
+            weight = 0.5 if rows == "equal" else 1.0
+            hessian += weight * (uu - vv).T @ (uu - vv)
     return OrthonormalityForm(hessian, linear, constant)
 
 

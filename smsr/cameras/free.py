@@ -137,7 +137,7 @@ def free_cameras(
     ladder = [(size, weight) for weight in weights]
     others = [setting for setting in dict.fromkeys(rest) if setting not in ladder]
     largest = usable_rank(values, 3 * size)
-    form = orthonormality_form(scaled_motion(left, values, largest), unit_scale=True)
+    form = orthonormality_form(scaled_motion(left, values, largest), rows="unit")
     measurements = left * values
     tried: list[_Relaxation] = []
 

@@ -126,7 +126,7 @@ def thresholded_factor(
         Relative change in each iteration.
     """
     frames = len(motion) // 2
-    form = orthonormality_form(motion, unit_scale=False)
+    form = orthonormality_form(motion, rows="published")
     lipschitz = form.lipschitz()
     lengths = mean_square_length(motion)
     f = symmetric_vector(nearest_semidefinite(start, 3))

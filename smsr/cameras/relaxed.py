@@ -120,7 +120,7 @@ def relaxed_factor(
     """
     frames, n = len(motion) // 2, motion.shape[1]
     if form is None:
-        form = orthonormality_form(motion, unit_scale=True)
+        form = orthonormality_form(motion, rows="unit")
     form = form.leading(n)
     H, b = form.hessian / frames, form.linear / frames
     penalty = max(trace_weight, math.sqrt(trace_weight * _LIGHT))
@@ -142,8 +142,8 @@ def relaxed_factor(
         if residuals[-1] < tolerance:
             break
         if iteration % _BALANCE_EVERY == 0:
-            change = math.sqrt(primal / max(dual, np.finfo(float).tiny))
-            change = min(max(change, 1.0 / _MOST_CHANGE), _MOST_CHANGE)
+            change = math.sqrt(primal / max(dual, primal / _MOST_CHANGE**2))
+            change = max(change, 1.0 / _MOST_CHANGE)
             if not 1.0 / _BALANCE < change < _BALANCE:
                 penalty, u = change * penalty, u / change
                 system = cho_factor(H + penalty * np.eye(len(H)), check_finite=False)

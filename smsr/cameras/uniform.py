@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _OUTLIER = 0.2  # radians; frames farther off count less in the fit
 _FIT_STEPS = 8
+_FIRST_WINDOW = 8  # frames
 
 
 def fit_uniform_turn(rotations: NDArray[np.float64]) -> Turn:
@@ -41,9 +42,8 @@ def fit_uniform_turn(rotations: NDArray[np.float64]) -> Turn:
     time = np.arange(frames) - centre
     velocity = np.median(so3.log(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)), axis=0)
     middle = _most_central(rotations, velocity)
-    window = 4
-    while window < frames:
-        window = min(2 * window, frames)
+    window = min(_FIRST_WINDOW, frames)
+    while True:
         first = min(max(0, centre - window // 2), frames - window)
         part = slice(first, first + window)
         for _ in range(_FIT_STEPS):
@@ -60,6 +60,9 @@ def fit_uniform_turn(rotations: NDArray[np.float64]) -> Turn:
             )[0]
             velocity = velocity + step[:3]
             middle = so3.exp(step[None, 3:])[0] @ middle
+        if window == frames:
+            break
+        window = min(2 * window, frames)
     return steady_turn(time.astype(np.float64), velocity, middle)
 
 

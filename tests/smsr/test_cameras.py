@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from smsr.benchmark.camera_paths import lissajous
 from smsr.benchmark.sheets import SHEETS, sheet_tracks
 from smsr.cameras.axis import fit_axis
 from smsr.cameras.constraints import (
+    Rows,
     frame_products,
     orthonormality_form,
     symmetric_matrix,
@@ -120,7 +121,7 @@ class TestConstraints:
     def test_published_form_is_the_residual_of_the_constraints(self, frames: int) -> None:
         M = np.random.default_rng(0).standard_normal((2 * frames, 6))
         F = random_symmetric(6)
-        form = orthonormality_form(M, unit_scale=False)
+        form = orthonormality_form(M, rows="published")
         direct = 0.0
         for u, v in zip(M[0::2], M[1::2], strict=True):
             direct += (u @ F @ u - v @ F @ v) ** 2 + 2 * (u @ F @ v) ** 2
@@ -129,17 +130,26 @@ class TestConstraints:
         np.testing.assert_allclose(form.hessian, form.hessian.T, atol=1e-9)
         assert form.lipschitz() >= np.linalg.eigvalsh(form.hessian)[-1]
 
+    @pytest.mark.parametrize("rows", ["unit", "equal"])
+    def test_forms_do_not_depend_on_how_the_image_is_rotated(self, rows: Rows) -> None:
+        M = np.random.default_rng(0).standard_normal((40, 6))
+        turn = Rotation.from_euler("z", 0.7).as_matrix()[:2, :2]
+        turned = (turn @ M.reshape(20, 2, 6)).reshape(40, 6)
+        f = symmetric_vector(random_symmetric(6))
+        first, second = (orthonormality_form(m, rows=rows) for m in (M, turned))
+        assert first.residual(f) == pytest.approx(second.residual(f))
+
     def test_unit_form_is_the_distance_of_the_gram_matrices_from_the_identity(self) -> None:
         M = np.random.default_rng(0).standard_normal((40, 6))
         F = random_symmetric(6)
-        form = orthonormality_form(M, unit_scale=True)
+        form = orthonormality_form(M, rows="unit")
         grams = np.array([M[i : i + 2] @ F @ M[i : i + 2].T for i in range(0, 40, 2)])
         assert form.residual(symmetric_vector(F)) == pytest.approx(((grams - np.eye(2)) ** 2).sum())
 
-    @pytest.mark.parametrize("unit_scale", [False, True])
-    def test_gradient_is_half_the_derivative_of_the_residual(self, unit_scale: bool) -> None:
+    @pytest.mark.parametrize("rows", get_args(Rows))
+    def test_gradient_is_half_the_derivative_of_the_residual(self, rows: Rows) -> None:
         M = np.random.default_rng(0).standard_normal((20, 5))
-        form = orthonormality_form(M, unit_scale=unit_scale)
+        form = orthonormality_form(M, rows=rows)
         f, d = symmetric_vector(random_symmetric(5)), symmetric_vector(random_symmetric(5, 1))
         h = 1e-6
         slope = (form.residual(f + h * d) - form.residual(f - h * d)) / (4 * h)
@@ -537,6 +547,17 @@ class TestUniform:
     def test_fit_recovers_a_uniform_turn(self, degrees: float) -> None:
         true = orbit(101, degrees)
         np.testing.assert_allclose(fit_uniform_turn(true).rotations, true, atol=1e-7)
+
+    @pytest.mark.parametrize("frames", [2, 3, 4, 5])
+    def test_fit_to_few_frames_is_a_fit(self, frames: int) -> None:
+        true = orbit(frames, 20.0)
+        errors = 0.05 * np.random.default_rng(0).standard_normal((frames, 3))
+        noisy = so3.exp(errors) @ true
+        turn = fit_uniform_turn(noisy)
+        rest = np.linalg.norm(so3.log(turn.rotations @ noisy.transpose(0, 2, 1)))
+        for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+            near = dataclasses.replace(turn, velocity=turn.velocity + 0.01 * axis)
+            assert np.linalg.norm(so3.log(near.rotations @ noisy.transpose(0, 2, 1))) > rest
 
     def test_fit_is_little_disturbed_by_outliers(self) -> None:
         true = orbit(100)

@@ -167,6 +167,15 @@ class TestReconstruction:
         np.testing.assert_allclose(other.shapes, some.shapes, atol=1e-6 * np.abs(some.shapes).max())
         np.testing.assert_allclose(other.scales, scales * some.scales, rtol=1e-6)
 
+    def test_does_not_depend_on_how_the_image_is_rotated(self) -> None:
+        W = image(BODY, TURN, approach(FRAMES))
+        turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+        some = reconstruct(W, camera_scale="varying")
+        other = reconstruct(
+            (turn @ W.reshape(FRAMES, 2, -1)).reshape(W.shape), camera_scale="varying"
+        )
+        np.testing.assert_allclose(other.scales, some.scales, rtol=1e-6)
+
     def test_does_not_depend_on_the_order_of_the_points(self) -> None:
         W = image(BODY, TURN, approach(FRAMES))
         order = np.random.default_rng(0).permutation(W.shape[1])
