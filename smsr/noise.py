@@ -119,7 +119,7 @@ def virtual_points(
     quiet = smooth_in_time(left[:, :kept] * values[:kept], sigma)
     directions, strengths, turn = np.linalg.svd(quiet, full_matrices=False)
     if strengths[0] <= 1e-9 * values[0]:  # nothing but noise, so there is nothing to take it off
-        return VirtualPoints(left, values, left.T / values[:, None])
+        return VirtualPoints(left, values, left.T / values[:, None], neglected=math.inf)
     count = max(1, int((strengths > 1e-9 * strengths[0]).sum()))
     whitened = left[:, :kept].T / values[:kept, None]
     return VirtualPoints(

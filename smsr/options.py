@@ -14,6 +14,8 @@ import typing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import numpy as np
+
 from smsr.errors import InvalidOption, UnknownOption
 
 if TYPE_CHECKING:
@@ -78,9 +80,9 @@ class Options:
     )
     noise: float | None = option(
         None,
-        "Standard deviation of the noise of the tracks, in their own units; it is taken off "
-        "before solving. 0 reproduces the tracks exactly; null has it estimated in the default "
-        "preset and is 0 in the preset 'paper'.",
+        "Standard deviation of the noise of the tracks, in their own units and below their spread; "
+        "it is taken off before solving. 0 reproduces the tracks exactly; null has it estimated in "
+        "the default preset and is 0 in the preset 'paper'.",
         minimum=0.0,
     )
     camera_model: Literal["auto", "relaxed", "uniform", "paper"] = option(
@@ -104,10 +106,18 @@ class Options:
         maximum=30,
     )
     camera_iterations: int = option(
-        500, "Most iterations of the camera stage.", minimum=1, maximum=100_000
+        500,
+        "Most iterations of each convex problem of the camera stage; in 'paper', most gradient "
+        "steps for each basis size.",
+        minimum=1,
+        maximum=100_000,
     )
     camera_tolerance: float = option(
-        1e-6, "Relative residual at which the camera stage stops.", minimum=1e-15, maximum=1.0
+        1e-6,
+        "Relative residual at which a convex problem of the camera stage stops; 'paper' stops "
+        "where a step changes less than a ten-thousandth.",
+        minimum=1e-15,
+        maximum=1.0,
     )
     smoothing: bool | None = option(
         None,
@@ -133,7 +143,11 @@ class Options:
         "faded out where the tracks do not bear it out, and one shape for a rigid object.",
     )
     shape_iterations: int = option(
-        1000, "Most iterations of the shape stage.", minimum=1, maximum=100_000
+        1000,
+        "Most iterations of each way into the shape problem; there are up to two for each of two "
+        "sets of cameras.",
+        minimum=1,
+        maximum=100_000,
     )
     shape_tolerance: float = option(
         1e-4,
@@ -283,6 +297,8 @@ def parse(cls: type[O], values: Mapping[str, object]) -> O:
 
 
 def _check(what: OptionDescription, value: object) -> int | float | bool | str | None:
+    if isinstance(value, np.generic):
+        value = value.item()
     if value is None and what.nullable:
         return None
     match what.type:
@@ -304,7 +320,8 @@ def _check(what: OptionDescription, value: object) -> int | float | bool | str |
         low = -math.inf if what.minimum is None else what.minimum
         high = math.inf if what.maximum is None else what.maximum
         if not low <= number <= high:
-            raise _invalid(what, value, f"must be between {low:g} and {high:g}")
+            bounds = f"between {low:g} and {high:g}" if math.isfinite(high) else f"at least {low:g}"
+            raise _invalid(what, value, f"must be {bounds}")
         if what.type == "number":
             return float(number)
     return typing.cast("int | float | bool | str", value)

@@ -28,7 +28,7 @@ from smsr.cautions import (
     size_cautions,
 )
 from smsr.completion import completed
-from smsr.errors import Cancelled
+from smsr.errors import Cancelled, InvalidOption
 from smsr.lifting import denoised_lifting, exact_lifting, smoothed_lifting
 from smsr.measurements import as_source
 from smsr.options import Options, parse, resolve
@@ -174,7 +174,19 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
         Resolved.
     clock : _Clock
         Receives the reports of the stages.
+
+    Raises
+    ------
+    InvalidOption
+        Noise that is not below the spread of the tracks, of which it is a part.
     """
+    if options.noise is not None and options.noise >= space.spread:
+        raise InvalidOption(
+            f"Option 'noise' must be below {space.spread:.3g}, the spread of the points of a frame "
+            f"about their mean, of which it is a part; it was {options.noise:g}. Give the standard "
+            "deviation in the units of the tracks, or null to have it estimated.",
+            option="noise",
+        )
     with clock.stage("scales") as hook:
         if options.camera_scale == "constant":
             scaling = None
@@ -377,6 +389,12 @@ def _merge(options: Options | None, values: dict[str, Any]) -> Options:
     """Return the options given as one object and by name, checked."""
     if options is None:
         return parse(Options, values)
+    if not isinstance(options, Options):
+        raise InvalidOption(
+            "`options` must be an smsr.Options; single options are given by name, as in "
+            "reconstruct(W, preset='paper').",
+            option="options",
+        )
     given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Options)}
     return parse(Options, given | values)
 

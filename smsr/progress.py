@@ -33,8 +33,8 @@ class Progress:
 
 
 ProgressCallback: TypeAlias = Callable[[Progress], object]
-"""Called with each report. Returning exactly ``False`` cancels the run (`smsr.Cancelled` is raised
-by the solver); an exception it raises passes through unchanged."""
+"""Called with each report. Returning exactly ``False`` cancels the run (`smsr.errors.Cancelled` is
+raised by the solver); an exception it raises passes through unchanged."""
 
 
 StageHook: TypeAlias = Callable[[float, int, float | None], None]

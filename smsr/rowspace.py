@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 _EPS = float(np.finfo(np.float64).eps)
 _LARGEST = 1e150  # so that squares stay finite
+_SMALLEST = 1e-150  # so that they stay above zero
 
 SAMPLE = 512
 """Most points that are kept as they are."""
@@ -195,15 +196,18 @@ def _factor_chunk(source: MeasurementSource, chunk_bytes: int) -> int:
 
 def _row_space(total: Triangle, shift: NDArray[np.float64], source: MeasurementSource) -> RowSpace:
     """Turn the triangle of all points into the factor, by its singular value decomposition."""
-    if not np.abs(total.rows).max() < _LARGEST:
+    largest = float(np.abs(total.rows).max())
+    if not largest < _LARGEST:
         raise _too_large()
     with few_blas_threads(total.rows):
         _, values, right = np.linalg.svd(total.rows, full_matrices=False)
     means = shift + total.mean
     spread = float(np.linalg.norm(values)) / np.sqrt(2 * source.frames * source.points)
     single = np.dtype(source.dtype).kind == "f" and np.dtype(source.dtype).itemsize <= 4
-    precision = np.finfo(source.dtype if single else np.float64).eps
-    if spread <= precision * float(np.abs(means).max()):
+    numbers = np.finfo(source.dtype if single else np.float64)
+    if 0.0 < largest < (numbers.tiny if single else _SMALLEST):
+        raise _too_small()
+    if spread <= numbers.eps * float(np.abs(means).max()):
         raise constant_measurements()
     rank = _rank(values, 2 * source.frames)
     return RowSpace(
@@ -226,6 +230,13 @@ def _signed(left: NDArray[np.float64]) -> NDArray[np.float64]:
     signs = np.sign(np.take_along_axis(left, np.abs(left).argmax(axis=0)[None], axis=0))
     signed: NDArray[np.float64] = left * signs
     return signed
+
+
+def _too_small() -> InputError:
+    return InputError(
+        "The points differ by too little for the solver's arithmetic. Scale the measurements up; "
+        "pixels are a good unit."
+    )
 
 
 def _too_large() -> InputError:

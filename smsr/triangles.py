@@ -93,7 +93,8 @@ def triangle_of(
         if triangle is None:
             triangle = _triangle_by_householder(block, shift)
         return dataclasses.replace(
-            triangle, sample=block[:, within(points, sampled)] - shift[:, None]
+            triangle,
+            sample=block[:, within(points, sampled)].astype(np.float64) - shift[:, None],
         )
 
 

@@ -53,6 +53,7 @@ LOOSE = frozenset({"gimbal", "axis"})
 
 _FREE_ANGLES = 6  # as many parameters as a turn counts that goes on in any way about one axis
 _MOTION_WEIGHT = 1.5
+_LEAST_MOTION = 1e-12  # by the nuclear norm, for measurements of unit size
 _REST_SMOOTHING = 4.0  # frames
 _SWITCH = 0.3  # change of the velocity from a frame to the next, in parts of it
 _SWITCHES_PER_PARAMETER = 4  # a switch within a frame shows in two, and its level is known
@@ -263,10 +264,10 @@ class Trial:
         unexplained = self._unexplained(path)
         tiny = np.finfo(float).tiny
         problem = self._solve(path.turn.every(self.step).rotations)
-        motion = max(problem.motion(), tiny)
+        nuclear = float(problem.spectrum().sum())
+        motion = max(problem.motion(), _LEAST_MOTION * nuclear, tiny)
         gain = max(0.0, math.log(max(problem.image_motion(), tiny) / motion))
         rise = math.log(motion / max(self._free.motion(), tiny))
-        nuclear = float(problem.spectrum().sum())
         return Verdict(
             unexplained,
             f"leaves {unexplained:.1%} of the rotation unexplained and changes the motion of the "

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 
+from smsr.errors import NumericalFailure
 from smsr.progress import ignore
 from smsr.proximal import singular_value_threshold, singular_values
 from smsr.rotations import depths_along
@@ -108,7 +109,7 @@ class DepthProblem:
             penalty + motion_weight * self._diagonal, motion_weight * self._off_diagonal
         )
         if failed:
-            raise np.linalg.LinAlgError("The motion of the depths is not positive definite.")
+            raise NumericalFailure("The motion of the depths is not positive definite.")
         return diagonal, off_diagonal
 
     def start_from_least_motion(self) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from smsr import evaluate, reconstruct
+from smsr.errors import InvalidOption
 from smsr.noise import (
     estimate_noise,
     marchenko_pastur_quantiles,
@@ -133,6 +134,14 @@ class TestReconstruction:
     def test_a_level_that_is_given_is_used(self) -> None:
         example = make_low_rank(60, 40, 1, noise=0.05)
         assert reconstruct(example.measurements, noise=0.02).diagnostics.noise == 0.02
+
+    @pytest.mark.parametrize("noise", [1.01, 1e300])
+    def test_noise_is_a_part_of_the_spread(self, noise: float) -> None:
+        example = make_low_rank(20, 12, 1, seed=3)
+        tracks = example.measurements
+        spread = (tracks - tracks.mean(axis=1, keepdims=True)).std()
+        with pytest.raises(InvalidOption, match=f"below {spread:.3g}"):
+            reconstruct(tracks, noise=noise * spread)
 
     def test_cameras_see_the_shapes_without_the_noise(self) -> None:
         example = make_low_rank(80, 60, 1, noise=0.1, seed=3)

@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import pytest
 
 from smsr.errors import InvalidOption, UnknownOption
@@ -45,6 +46,11 @@ def test_parse_accepts_good_values_and_integers_for_numbers() -> None:
     assert isinstance(sample.ratio, float)
 
 
+def test_parse_takes_numbers_of_numpy() -> None:
+    values = {"count": np.int64(9), "ratio": np.float32(2.0), "flag": np.True_}
+    assert parse(Sample, values) == Sample(count=9, ratio=2.0, flag=True)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "rule"),
     [
@@ -55,7 +61,8 @@ def test_parse_accepts_good_values_and_integers_for_numbers() -> None:
         ("count", None, "type integer"),
         ("ratio", "0.5", "type number"),
         ("ratio", float("nan"), "type number"),
-        ("ratio", -0.1, "between 0 and inf"),
+        ("ratio", -0.1, "at least 0;"),
+        ("count", np.float64(3.0), "type integer"),
         ("name", 5, "type string or null"),
         ("mode", "slow", "one of fast, exact"),
         ("flag", 1, "type boolean"),

@@ -124,6 +124,12 @@ class TestResult:
         assert result.cameras.dtype == result.translations.dtype == np.float64
         assert_valid(result, W, tolerance=1e-5)
 
+    def test_more_than_double_precision_is_taken_for_double(self) -> None:
+        tracks = make_low_rank(20, 12, seed=3).measurements
+        result = reconstruct(tracks.astype(np.longdouble))
+        assert result.shapes.dtype == np.float64
+        np.testing.assert_allclose(result.shapes, reconstruct(tracks).shapes, atol=1e-9)
+
     def test_deterministic(self, example: smsr.synthetic.Example) -> None:
         first, second = (reconstruct(example.measurements) for _ in range(2))
         np.testing.assert_array_equal(first.shapes, second.shapes)
@@ -335,6 +341,10 @@ class TestProgress:
 
 
 class TestOptions:
+    def test_an_object_that_is_no_options_is_refused(self) -> None:
+        with pytest.raises(InvalidOption, match="by name"):
+            reconstruct(make_low_rank(6, 8, 1).measurements, options={"preset": "paper"})  # type: ignore[arg-type]
+
     def test_values_override_the_object(self) -> None:
         W = SEQUENCES["nodding"].measurements
         result = reconstruct(W, options=Options(camera_model="relaxed"), shape_iterations=7)
@@ -476,6 +486,16 @@ class TestDegenerateInput:
         assert "near-planar" not in {caution.code for caution in result.diagnostics.cautions}
         thickness = np.linalg.svd(result.shapes[0] - result.shapes[0].mean(axis=0))[1]
         assert thickness[2] < 0.02 * thickness[1]
+
+    def test_noise_alone_leaves_an_object_at_rest(self) -> None:
+        digits = (
+            "62201631 61130224 43061451 21213456 65152431 65653505 25036114 35324136 "
+            "30044126 00556320 23304032 35442246 30621400 54230363 34206402 20554402 "
+            "36531233 03021000 05200564 64530034 42255422 03653250 32663141 05626534"
+        )
+        tracks = np.array([[int(digit) - 3.0 for digit in row] for row in digits.split()])
+        result = reconstruct(tracks, camera_model="uniform", camera_scale="varying")
+        assert np.isfinite(result.shapes).all()
 
     def test_who_asks_for_relaxed_cameras_gets_them(self) -> None:
         W, _, _ = sheet_tracks("paper", "lissajous", seed=0)

@@ -202,6 +202,15 @@ class TestFactorise:
             with pytest.raises(InputError, match="too large"):
                 factorise(as_source(W * (largest / np.abs(W).max())))
 
+    @pytest.mark.parametrize("points", [40, 20_000])
+    @pytest.mark.parametrize(
+        ("scale", "dtype"), [(1e-160, np.float64), (1e-300, np.float64), (1e-42, np.float32)]
+    )
+    def test_too_small_differences(self, scale: float, dtype: type, points: int) -> None:
+        W: NDArray[Any] = (low_rank(5, points) * scale).astype(dtype)
+        with pytest.raises(InputError, match="too little"):
+            factorise(as_source(W))
+
     @pytest.mark.parametrize("scale", [1e-145, 1e145])
     @pytest.mark.parametrize("points", [40, 20_000])
     def test_any_unit_will_do(self, scale: float, points: int) -> None:
