@@ -52,6 +52,7 @@ class Source:
     Parameters
     ----------
     what : path or ndarray
+        Masked entries of a masked array become NaN.
     role : str
         What the file is to the job; an array is named after it.
     """
@@ -63,7 +64,7 @@ class Source:
             self.name, self.bytes = self._content.name, self._content.stat().st_size
         else:
             written = io.BytesIO()
-            np.save(written, np.asarray(what), allow_pickle=False)
+            np.save(written, _unmasked(what), allow_pickle=False)
             self._content = written.getvalue()
             self.name, self.bytes = f"{role}.npy", len(self._content)
 
@@ -156,6 +157,13 @@ class PartialFile:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+
+def _unmasked(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array whose masked entries are NaN, as `smsr.reconstruct` takes them."""
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
+        return np.where(np.ma.getmaskarray(array), np.nan, np.ma.getdata(array))
+    return np.asarray(array)
 
 
 def _strong_tag(response: httpx.Response) -> str:

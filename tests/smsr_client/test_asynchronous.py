@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING
+import io
+from typing import TYPE_CHECKING, Any, cast
 
 import anyio
 import httpx
 import numpy as np
 import pytest
 
+from smsr import reconstruct
 from smsr.synthetic import make_example
 from smsr_client import AsyncClient, Client, JobFailed, ServiceError
+from smsr_client.transfer import Counter, Source
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from smsr.synthetic import Example
     from smsr_client import Job
@@ -71,6 +76,49 @@ def test_arrays_go_in_and_arrays_come_out(served: Served, example: Example) -> N
     tracks += result.translations[:, :, None]
     given = example.measurements.reshape(tracks.shape)
     assert np.abs(tracks - given).max() < 0.05 * np.ptp(given)
+
+
+def _sent(array: NDArray[Any], role: str = "measurements") -> NDArray[Any]:
+    source = Source(array, role)
+    with source.open(Counter(source.bytes, None)) as file:
+        return cast("NDArray[Any]", np.load(io.BytesIO(file.read())))
+
+
+@pytest.mark.parametrize(
+    ("given", "sent"),
+    [("float32", "float32"), ("float64", "float64"), ("int16", "float64"), ("int64", "float64")],
+)
+def test_masked_entries_are_sent_as_nan(given: str, sent: str) -> None:
+    values = np.arange(12).reshape(3, 4).astype(given)
+    array = np.ma.masked_array(values, mask=values == 5)
+    found = _sent(array)
+    assert found.dtype == sent
+    assert np.array_equal(found, np.where(values == 5, np.nan, values), equal_nan=True)
+    assert array.mask.sum() == 1, "what was given stays as it is"
+    # Without a masked entry there is nothing that integers could not say.
+    assert _sent(np.ma.masked_array(values, mask=False)).dtype == given
+
+
+def test_masked_tracks_are_refused_or_completed_as_by_the_library(
+    served: Served, example: Example
+) -> None:
+    tracks = np.ma.masked_array(example.measurements, mask=False)
+    tracks[3, 5] = np.ma.masked
+    tracks.data[3, 5] = 1e6  # what lies under the mask
+    with Client(served.url) as client:
+        with pytest.raises(JobFailed, match="missing='complete'"):
+            client.reconstruct(tracks)
+        sent = client.reconstruct(tracks, options={"missing": "complete"})
+    here = reconstruct(tracks, missing="complete")
+    # The service keeps shapes in single precision.
+    assert np.allclose(sent.shapes, here.shapes, atol=1e-3 * np.ptp(here.shapes))
+
+
+def test_no_error_is_measured_against_what_is_masked(served: Served, example: Example) -> None:
+    truth = np.ma.masked_array(example.ground_truth, mask=False)
+    truth[3, 5] = np.ma.masked
+    with Client(served.url) as client, pytest.raises(JobFailed, match="ground truth"):
+        client.reconstruct(example.measurements, ground_truth=truth)
 
 
 async def test_an_event_loop_does_the_same(served: Served, example: Example) -> None:
