@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 from urllib.parse import quote, urlencode, urlsplit
 
 import httpx
+import numpy as np
 
 from smsr_client.documents import (
     FINAL,
@@ -145,8 +146,8 @@ class Flows:
         if total >= resumable:
             return (yield from self._submit_uploads(sources, options, settings, headers, counter))
         # The options go first, so that the server can refuse early.
-        data = {"options": json.dumps(dict(options))} if options else {}
-        data |= {name: _text(value) for name, value in (settings or {}).items()}
+        data = {"options": json.dumps(_plain(options))} if options else {}
+        data |= {name: _text(value) for name, value in _plain(settings).items()}
         with contextlib.ExitStack() as stack:
             files = {
                 role: (source.name, stack.enter_context(source.open(counter)))
@@ -171,7 +172,7 @@ class Flows:
         counter: Counter,
     ) -> Flow[Job]:
         counter.to(0)
-        document: dict[str, object] = {**(settings or {}), "options": dict(options or {})}
+        document: dict[str, object] = _plain(settings) | {"options": _plain(options)}
         for role, source in sources.items():
             upload_id = yield from self._upload(source, role, counter)
             document[role] = {"upload": upload_id}
@@ -270,7 +271,7 @@ class Flows:
 
     def keep(self, job_id: str, ttl: float | None) -> Flow[Job]:
         """Set the time to live of a job."""
-        call = Call("PATCH", f"/v1/jobs/{job_id}", {}, {"json": {"ttl": ttl}})
+        call = Call("PATCH", f"/v1/jobs/{job_id}", {}, {"json": _plain({"ttl": ttl})})
         answer = yield from self._insist(lambda: call)
         return Job.model_validate_json(answer.content)
 
@@ -382,6 +383,14 @@ def retry_after(response: httpx.Response) -> float:
 def unanswered(server: str, error: Exception) -> str:
     """Return what to tell a person whose server does not answer."""
     return f"No answer from {server} ({error}). Is the server running, and is its address right?"
+
+
+def _plain(values: Mapping[str, object] | None) -> dict[str, object]:
+    """Return values with the scalars of numpy, which JSON does not know, as numbers of Python."""
+    return {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in (values or {}).items()
+    }
 
 
 def _text(value: object) -> str:

@@ -14,6 +14,7 @@ import pytest
 from smsr import reconstruct
 from smsr.synthetic import make_example
 from smsr_client import AsyncClient, Client, JobFailed, ServiceError
+from smsr_client.flows import RESUMABLE_BYTES
 from smsr_client.transfer import Counter, Source
 
 if TYPE_CHECKING:
@@ -119,6 +120,29 @@ def test_no_error_is_measured_against_what_is_masked(served: Served, example: Ex
     truth[3, 5] = np.ma.masked
     with Client(served.url) as client, pytest.raises(JobFailed, match="ground truth"):
         client.reconstruct(example.measurements, ground_truth=truth)
+
+
+@pytest.mark.parametrize("resumable", [1, RESUMABLE_BYTES], ids=["tus", "form"])
+def test_numbers_of_numpy_are_options_and_settings(
+    served: Served, example: Example, resumable: int
+) -> None:
+    with Client(served.url) as client:
+        job = client.submit(
+            example.measurements,
+            options={
+                "basis_size": np.int64(3),
+                "smoothing": np.bool_(True),
+                "penalty": np.float32(0.5),
+            },
+            settings={"ttl": np.int64(1000), "reuse": np.bool_(False)},
+            resumable=resumable,
+        )
+        assert job.options["basis_size"] == 3
+        assert job.options["smoothing"] is True
+        assert job.options["penalty"] == 0.5
+        assert job.ttl == 1000
+        assert client.keep(job.id, np.int64(2000)).ttl == 2000  # type: ignore[arg-type]
+        client.delete(job.id)
 
 
 async def test_an_event_loop_does_the_same(served: Served, example: Example) -> None:
