@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -108,3 +109,14 @@ def test_pictures_and_pages_that_the_readme_names_are_there() -> None:
     for folder in re.findall(r"`(docker/[\w./]+)`", README):
         assert (ROOT / folder).exists(), folder
     assert Path(ROOT / "docs/images/reconstruction.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_all_who_build_the_page_are_told_the_same_version_of_node() -> None:
+    package = json.loads((ROOT / "service" / "page" / "package.json").read_text(encoding="utf-8"))
+    wanted = package["engines"]["node"].removeprefix(">=")
+    for name in ("README.md", "CONTRIBUTING.md", "scripts/page", "service/routes/page.py"):
+        told = re.findall(
+            r"Node\.js (?:>= )?(\d[\d.]*\d)", (ROOT / name).read_text(encoding="utf-8")
+        )
+        assert told, name
+        assert set(told) == {wanted}, name

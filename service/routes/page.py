@@ -43,7 +43,7 @@ _NOT_BUILT = b"""<!doctype html>
 <meta name="color-scheme" content="light dark"></head>
 <body><h1>SMSR</h1>
 <p>The service runs. Its web page has not been built: <code>make page</code> does so, and needs
-Node.js 20 or later.</p>
+Node.js 20.19 or later.</p>
 <p>All that the page does the API does too: <a href="docs">its documentation</a>.</p>
 </body></html>
 """
