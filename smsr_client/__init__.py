@@ -27,6 +27,7 @@ from smsr_client.errors import (
     JobFailed,
     ServerUnreachable,
     ServiceError,
+    WrongAddress,
     require_success,
 )
 from smsr_client.result import Result
@@ -46,5 +47,6 @@ __all__ = [
     "Result",
     "ServerUnreachable",
     "ServiceError",
+    "WrongAddress",
     "require_success",
 ]

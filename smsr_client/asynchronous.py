@@ -9,6 +9,7 @@ import anyio
 import httpx
 from anyio import to_thread
 
+from smsr_client.address import server_address
 from smsr_client.events import Following
 from smsr_client.flows import (
     RESUMABLE_BYTES,
@@ -59,6 +60,11 @@ class AsyncClient:
         Where the service needs one; by default that of the environment, SMSR_API_KEY.
     transport : httpx.AsyncBaseTransport, optional
         Another way to the server than the network.
+
+    Raises
+    ------
+    WrongAddress
+        The server's is no ``http://`` or ``https://`` address.
     """
 
     def __init__(
@@ -69,7 +75,7 @@ class AsyncClient:
         api_key: str | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        self.server = server.rstrip("/")
+        self.server = server_address(server)
         self._flows = Flows(self.server, patience)
         self._http = httpx.AsyncClient(transport=transport, **connection(self.server, api_key))
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import httpx
 
+from smsr_client.address import server_address
 from smsr_client.events import Following
 from smsr_client.flows import (
     RESUMABLE_BYTES,
@@ -55,6 +56,11 @@ class Client:
         Where the service needs one; by default that of the environment, SMSR_API_KEY.
     transport : httpx.BaseTransport, optional
         Another way to the server than the network.
+
+    Raises
+    ------
+    WrongAddress
+        The server's is no ``http://`` or ``https://`` address.
     """
 
     def __init__(
@@ -65,7 +71,7 @@ class Client:
         api_key: str | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        self.server = server.rstrip("/")
+        self.server = server_address(server)
         self._flows = Flows(self.server, patience)
         self._http = httpx.Client(transport=transport, **connection(self.server, api_key))
 

@@ -27,6 +27,10 @@ class ClientError(Exception):
     """Base of what this client raises."""
 
 
+class WrongAddress(ClientError, ValueError):
+    """What was given as a server's address is none."""
+
+
 class ServerUnreachable(ClientError):
     """No answer from the server, however often it was asked."""
 

@@ -7,14 +7,14 @@ import time
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Final
 
+import httpx
+
 from smsr_client.documents import FINAL, Job
 from smsr_client.errors import ServerUnreachable, ServiceError, refusal_of
 from smsr_client.flows import FIRST_PAUSE, LONGEST_PAUSE, TRY_AGAIN, Call, retry_after, unanswered
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    import httpx
 
     from smsr_client.flows import Flows
 
@@ -135,9 +135,10 @@ class Following:
         Raises
         ------
         ServerUnreachable
-            It has been tried for long enough.
+            It has been tried for long enough, or no time will help.
         """
-        if time.monotonic() + self._pause > self._deadline:
+        never = isinstance(error, httpx.UnsupportedProtocol)
+        if never or time.monotonic() + self._pause > self._deadline:
             raise ServerUnreachable(unanswered(self._flows.server, error)) from error
         return self._next_pause()
 

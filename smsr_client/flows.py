@@ -343,12 +343,12 @@ class Flows:
         while True:
             try:
                 response: httpx.Response = yield send()
+            except (httpx.UnsupportedProtocol, httpx.InvalidURL) as error:
+                raise ServerUnreachable(f"{self.server} cannot be asked: {error}") from error
             except httpx.TransportError as error:
                 if time.monotonic() + pause > deadline:
                     raise ServerUnreachable(unanswered(self.server, error)) from error
                 wanted = 0.0
-            except httpx.InvalidURL as error:
-                raise ServerUnreachable(f"{self.server} is no address: {error}.") from error
             else:
                 if not response.is_error:
                     return response

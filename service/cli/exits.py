@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from smsr.benchmark import BenchmarkFailed
 from smsr.errors import Cancelled, InputError, InvalidOption, SmsrError, UnknownOption
-from smsr_client import ClientError, ServerUnreachable, ServiceError
+from smsr_client import ClientError, ServerUnreachable, ServiceError, WrongAddress
 
 
 class ExitCode(enum.IntEnum):
@@ -50,7 +50,7 @@ def code_of(error: Exception) -> ExitCode:
     match error:
         case Cancelled():
             return ExitCode.INTERRUPTED
-        case UnknownOption() | InvalidOption():
+        case UnknownOption() | InvalidOption() | WrongAddress():
             return ExitCode.USAGE
         case InputError():
             return ExitCode.INPUT_REFUSED

@@ -302,6 +302,20 @@ def test_patience_ends(moody: _Moody) -> None:
         client.info()
 
 
+def test_an_address_that_no_request_goes_to_is_not_tried_again(
+    moody: _Moody, tmp_path: Path
+) -> None:
+    moody.answers = [lambda handler: answer(handler, 302, {}, Location="ftp://127.0.0.1/a")]
+    begun = time.monotonic()
+    with _client(moody, patience=60.0) as client:
+        with pytest.raises(ServerUnreachable, match="'ftp://'"):
+            client.download("0" * 32, "result.npz", tmp_path / "result.npz")
+        with pytest.raises(ServerUnreachable, match="non-printable"):
+            client.get("\n")
+    assert time.monotonic() - begun < 5
+    assert len(moody.paths) == 1
+
+
 def test_an_answer_that_is_no_problem_document_is_still_told(moody: _Moody) -> None:
     moody.answers = [lambda handler: answer(handler, 404, ["nothing"])]
     with _client(moody) as client, pytest.raises(ServiceError, match="404"):

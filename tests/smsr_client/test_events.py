@@ -44,6 +44,8 @@ def test_a_connection_that_breaks_is_made_again_for_as_long_as_there_is_patience
     assert pauses == sorted(set(pauses))
     with pytest.raises(ServerUnreachable, match="http://x"):
         hasty.broken(httpx.ReadError("broke"))
+    with pytest.raises(ServerUnreachable, match="'x://'"):
+        patient.broken(httpx.UnsupportedProtocol("Request URL has the protocol 'x://'"))
     with pytest.raises(ServiceError):
         hasty.ended(httpx.Response(503))
     assert patient.ended(httpx.Response(503, headers={"Retry-After": "9"})) == 9
