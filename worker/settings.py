@@ -31,7 +31,11 @@ class Settings(BaseSettings):
     """
 
     model_config = SettingsConfigDict(
-        env_prefix="SMSR_", frozen=True, extra="ignore", populate_by_name=True
+        env_prefix="SMSR_",
+        frozen=True,
+        extra="ignore",
+        populate_by_name=True,
+        hide_input_in_errors=True,  # there are secrets among them
     )
 
     data_dir: Path = Field(
@@ -41,6 +45,7 @@ class Settings(BaseSettings):
     redis_url: str | None = Field(
         default=None,
         validation_alias=AliasChoices("SMSR_REDIS_URL", "REDIS_URL"),
+        repr=False,  # it may have a password
         description="redis://, rediss:// or unix:// address of Redis 6.2 or later.",
     )
     storage_url: str | None = Field(

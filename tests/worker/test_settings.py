@@ -54,3 +54,29 @@ def test_a_job_may_ask_for_less_time_only() -> None:
 def test_wrong_settings_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         Settings(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [
+        ("SMSR_WEBHOOK_SECRET", "whsec_c2VjcmV0LW9mLXRoZS1jb21wYW55="),
+        ("SMSR_METRICS_TOKEN", "word-of-company"),
+    ],
+)
+def test_a_secret_that_is_wrong_is_not_told(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(ValidationError) as caught:
+        Settings()
+    assert value not in str(caught.value)
+
+
+def test_secrets_are_not_shown_with_the_settings() -> None:
+    settings = Settings(
+        metrics_token="word-of-the-company",
+        webhook_secret=f"whsec_{'c2Vj' * 8}",
+        redis_url="redis://:word-of-the-company@host",
+    )
+    assert "word-of" not in repr(settings)
+    assert "c2Vj" not in repr(settings)
