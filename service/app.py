@@ -32,7 +32,7 @@ from worker.disk import Disk
 from worker.logs import configure_logging
 from worker.maintenance import Maintenance
 from worker.queue import JobQueue
-from worker.settings import Settings
+from worker.settings import Settings, read_settings
 from worker.tracing import Tracing
 from worker.uploads import Digests, UploadStore
 
@@ -217,7 +217,7 @@ def app_from_environment() -> FastAPI:
     For servers that take a factory, as in ``uvicorn --factory service.app:app_from_environment``.
     Such a server does not say where it listens, so API keys are needed unless ``SMSR_ACCESS=open``.
     """
-    settings = Settings()
+    settings = read_settings()
     configure_logging(settings.log_level)
     return create_app(settings)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import uvicorn
+from uvicorn.config import STARTUP_FAILURE
 
 from service.app import create_app
 
@@ -61,5 +62,10 @@ def run_server(settings: Settings, listener: socket.socket, ready: Callable[[], 
         timeout_graceful_shutdown=settings.drain_seconds,
     )
     server = _Server(config, ready, lambda: app.state.context.feed.release())
-    server.run(sockets=[listener])
+    try:
+        server.run(sockets=[listener])
+    except SystemExit as stop:
+        # Uvicorn's own status, which among those of the command says that an input was refused.
+        if stop.code != STARTUP_FAILURE:
+            raise
     return server.started

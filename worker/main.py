@@ -32,7 +32,7 @@ from worker.pool import THREAD_VARIABLES
 from worker.processes import die_with_parent
 from worker.queue import JobQueue
 from worker.scratch import scratch_folder, sweep_scratch
-from worker.settings import Settings, environment_settings
+from worker.settings import Settings, WrongSettings, environment_settings, read_settings
 from worker.supervisor import Supervisor
 
 if TYPE_CHECKING:
@@ -190,7 +190,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m worker.main", description=main.__doc__)
     parser.add_argument("--burst", action="store_true", help="end when the queue is empty")
     arguments = parser.parse_args()
-    settings = Settings()
+    try:
+        settings = read_settings()
+    except WrongSettings as error:
+        parser.exit(2, "".join(f"Error: {problem}\n" for problem in error.problems))
     configure_logging(settings.log_level)
     run_worker(settings, burst=arguments.burst)
 

@@ -5,15 +5,24 @@ from __future__ import annotations
 import base64
 import functools
 import ipaddress
+import json
 import math
+import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import urlsplit
 
-from pydantic import AliasChoices, Field, field_validator
+from pydantic import AliasChoices, Field, ValidationError, field_validator
 from pydantic_core import PydanticCustomError
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from redis.connection import parse_url
 
 from worker.cgroup import available_cores, memory_limit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pydantic_core import ErrorDetails
 
 GIBIBYTE = 1 << 30
 DAY = 86400
@@ -21,6 +30,20 @@ DAY = 86400
 _WORKER_BYTES = 192 << 20
 """What a worker takes beside its job: the supervisor, the keeper and BLAS's buffers, measured."""
 _LEAST_BYTES = 64 << 20
+
+
+class WrongSettings(Exception):
+    """Settings with which nothing can run.
+
+    Parameters
+    ----------
+    problems : sequence of str
+        A line for each: the variable, what is wrong and what would be right, and no secrets.
+    """
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = tuple(problems)
 
 
 class Settings(BaseSettings):
@@ -221,18 +244,55 @@ class Settings(BaseSettings):
     webhook_timeout_seconds: float = Field(
         default=15, gt=0, le=120, description="Longest time of one attempt to deliver a webhook."
     )
-    webhook_pauses: tuple[Annotated[float, Field(gt=0, le=7 * DAY)], ...] = Field(
-        default=(5, 300, 1800, 7200, 18000, 36000, 36000),
-        description="Seconds between the attempts to deliver a webhook, as a JSON list; it is "
-        "given up after the last one.",
+    webhook_pauses: Annotated[tuple[Annotated[float, Field(gt=0, le=7 * DAY)], ...], NoDecode] = (
+        Field(
+            default=(5, 300, 1800, 7200, 18000, 36000, 36000),
+            description="Seconds between the attempts to deliver a webhook, as a JSON list; it is "
+            "given up after the last one.",
+        )
     )
 
-    @field_validator("metrics_token", "public_url", mode="before")
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = "INFO"
+
+    @field_validator("metrics_token", "public_url", "storage_url", mode="before")
     @classmethod
     def _none_when_empty(cls, given: object) -> object:
         return given or None  # how files of containers leave something unset
 
-    log_level: str = Field(default="INFO", pattern=r"^(DEBUG|INFO|WARNING|ERROR|CRITICAL)$")
+    @field_validator("redis_url")
+    @classmethod
+    def _redis_that_can_be_asked(cls, url: str | None) -> str | None:
+        if url is not None and not _names_redis(url):
+            # Nothing of the address is told: it may have a password.
+            raise PydanticCustomError(
+                "redis_url",
+                "it must be the address of a Redis server, as redis://host:6379/0, "
+                "rediss://host:6379/0 or unix:///folder/redis.sock",
+            )
+        return url
+
+    @field_validator("storage_url")
+    @classmethod
+    def _folder_or_bucket(cls, url: str | None) -> str | None:
+        parts = urlsplit(url or "file:///")
+        folder = parts.netloc in ("", "localhost") and parts.path.startswith("/")
+        if not {"file": folder, "s3": bool(parts.netloc)}.get(parts.scheme, False):
+            raise PydanticCustomError(
+                "storage_url", "it must be file:///folder or s3://bucket/prefix"
+            )
+        return url
+
+    @field_validator("webhook_pauses", mode="before")
+    @classmethod
+    def _list_of_text(cls, given: object) -> object:
+        if not isinstance(given, str):
+            return given
+        try:
+            return json.loads(given)
+        except ValueError:
+            raise PydanticCustomError(
+                "webhook_pauses", "it must be a JSON list of seconds, as [5, 300, 1800]"
+            ) from None
 
     @field_validator("webhook_secret")
     @classmethod
@@ -253,7 +313,10 @@ class Settings(BaseSettings):
     @classmethod
     def _networks(cls, networks: str) -> str:
         for network in networks.replace(",", " ").split():
-            ipaddress.ip_network(network)
+            try:
+                ipaddress.ip_network(network)
+            except ValueError as error:
+                raise ValueError(f"{error}; networks are written as 10.1.0.0/16") from None
         return networks
 
     @property
@@ -303,6 +366,52 @@ class Settings(BaseSettings):
             for name, value in values.items()
             if value is not None
         }
+
+
+def read_settings(**given: Any) -> Settings:
+    """Return the settings of the environment.
+
+    Parameters
+    ----------
+    **given
+        Settings that go before those of the environment.
+
+    Raises
+    ------
+    WrongSettings
+        Some of them cannot be.
+    """
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        found = error.errors(include_url=False, include_input=False)
+        raise WrongSettings([_line(problem) for problem in found]) from None
+
+
+def _names_redis(url: str) -> bool:
+    try:
+        options = parse_url(url)  # type: ignore[no-untyped-call]
+    except ValueError:
+        return False
+    return not url.startswith("unix:") or "path" in options
+
+
+def _line(problem: ErrorDetails) -> str:
+    """Return what an operator is told of a setting that cannot be."""
+    name, *place = map(str, problem["loc"])
+    what = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "string_pattern_mismatch":
+        what = f"{what}. {Settings.model_fields[name].description}"
+    if place:
+        what = f"item {int(place[0]) + 1}: {what}"
+    return f"{_variable(name)}: {what.rstrip('.')}."
+
+
+def _variable(name: str) -> str:
+    # Of a setting's two names pydantic tells the first, whichever was given.
+    if name == "SMSR_REDIS_URL" and name not in os.environ:
+        return "REDIS_URL"
+    return name if name.isupper() else f"SMSR_{name.upper()}"
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from rich.markup import escape
 from smsr.benchmark import BenchmarkFailed
 from smsr.errors import Cancelled, InputError, InvalidOption, SmsrError, UnknownOption
 from smsr_client import ClientError, ServerUnreachable, ServiceError, WrongAddress
+from worker.settings import WrongSettings
 
 
 class ExitCode(enum.IntEnum):
@@ -26,12 +27,12 @@ class ExitCode(enum.IntEnum):
 
 
 HELP = (
-    "Exit status: 0 done, 1 a job or the solver failed, 2 wrong usage, 3 an input was refused, "
-    "4 the server cannot be reached, 130 interrupted."
+    "Exit status: 0 done, 1 a job or the solver failed, 2 wrong usage or settings, "
+    "3 an input was refused, 4 the server cannot be reached, 130 interrupted."
 )
 
-EXPECTED = (SmsrError, ClientError, BenchmarkFailed, OSError)
-"""Errors that are told in a line; any other is a mistake of the program and keeps its traceback."""
+EXPECTED = (SmsrError, ClientError, BenchmarkFailed, WrongSettings, OSError)
+"""Errors that are told in lines; any other is a mistake of the program and keeps its traceback."""
 
 console = Console(highlight=False)
 """Standard output: results."""
@@ -50,7 +51,7 @@ def code_of(error: Exception) -> ExitCode:
     match error:
         case Cancelled():
             return ExitCode.INTERRUPTED
-        case UnknownOption() | InvalidOption() | WrongAddress():
+        case UnknownOption() | InvalidOption() | WrongAddress() | WrongSettings():
             return ExitCode.USAGE
         case InputError():
             return ExitCode.INPUT_REFUSED
@@ -72,5 +73,6 @@ def message_of(error: Exception) -> str:
 
 def leave(error: Exception) -> NoReturn:
     """End the process on an expected error."""
-    complain(message_of(error))
+    for problem in error.problems if isinstance(error, WrongSettings) else [message_of(error)]:
+        complain(problem)
     sys.exit(code_of(error))

@@ -21,7 +21,7 @@ from service.cli.local import AsJson
 from worker.connections import connect
 from worker.keys import ApiKey, KeyStore
 from worker.redis_server import ServerFailed, redis_of_folder
-from worker.settings import Settings
+from worker.settings import read_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -188,7 +188,7 @@ def revoke(
 @contextlib.contextmanager
 def _store(data_dir: Path | None) -> Iterator[KeyStore]:
     """Open the keys: in the Redis server of the settings, else in that of the data folder."""
-    settings = Settings()
+    settings = read_settings()
     with contextlib.ExitStack() as stack:
         url = settings.redis_url
         if url is None or data_dir is not None:

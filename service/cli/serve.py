@@ -18,11 +18,13 @@ import typer
 
 from service.cli.exits import ExitCode, complain, console, errors
 from worker.logs import configure_logging
-from worker.settings import Settings
+from worker.settings import read_settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from types import FrameType
+
+    from worker.settings import Settings
 
 _BACKLOG = 2048
 
@@ -52,7 +54,8 @@ def serve(
     from worker.pool import WorkerPool
     from worker.redis_server import DataFolderInUse, EmbeddedRedis, ServerFailed
 
-    settings = _settings(workers=workers or None, data_dir=data_dir)
+    given = {"workers": workers or None, "data_dir": data_dir}
+    settings = read_settings(**{name: v for name, v in given.items() if v is not None})
     configure_logging(settings.log_level)
     with _until_signalled(), contextlib.ExitStack() as stack:
         listener = stack.enter_context(contextlib.closing(_listen(host, port)))
@@ -107,7 +110,7 @@ def _tell_who_may_come(settings: Settings, listener: socket.socket) -> None:
 
 def worker() -> None:
     """Run one worker process of a cluster; REDIS_URL says where the queue is."""
-    settings = _settings()
+    settings = read_settings()
     if settings.redis_url is None:
         complain("Set REDIS_URL to the Redis server of the queue, or use smsr serve.")
         raise typer.Exit(ExitCode.USAGE)
@@ -115,13 +118,6 @@ def worker() -> None:
     # A program of its own: a worker sets its number of BLAS threads before NumPy is loaded, and
     # forks for each job, which a process that has started threads should not.
     os.execv(sys.executable, [sys.executable, "-m", "worker.main"])
-
-
-def _settings(**given: object) -> Settings:
-    """Return the settings of the environment, with those given on the command line."""
-    return Settings.model_validate(
-        Settings().model_dump() | {name: v for name, v in given.items() if v is not None}
-    )
 
 
 def _listen(host: str, port: int) -> socket.socket:

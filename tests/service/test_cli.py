@@ -31,13 +31,15 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.slow
 
 
-def smsr(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def smsr(
+    *arguments: str | Path, cwd: Path | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "service.cli", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=cwd,
-        env=clean_environment(),
+        env=clean_environment(**environment),
         timeout=240,
         check=False,
     )
@@ -372,6 +374,35 @@ def test_serve_says_that_a_port_is_taken(tmp_path: Path) -> None:
     assert run.returncode == 1
     assert f"port {port}" in run.stderr
     assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize("command", [["serve", "--port", "0"], ["worker"], ["keys", "list"]])
+def test_wrong_settings_are_told_in_a_line_each(command: list[str], tmp_path: Path) -> None:
+    run = smsr(
+        *command,
+        cwd=tmp_path,
+        SMSR_THREADS="abc",
+        SMSR_STORAGE_URL="foo",
+        SMSR_METRICS_TOKEN="word",
+        REDIS_URL="foo://:word@host",
+    )
+    assert run.returncode == 2, run.stderr
+    told = run.stderr.splitlines()
+    variables = ["REDIS_URL", "SMSR_STORAGE_URL", "SMSR_THREADS", "SMSR_METRICS_TOKEN"]
+    assert [line.split(": ")[:2] for line in told] == [["Error", name] for name in variables]
+    assert "s3://bucket/prefix" in told[1]
+    assert "word" not in run.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_service_that_cannot_start_has_failed(tmp_path: Path) -> None:
+    """And has not refused an input, which uvicorn's own status would say."""
+    (tmp_path / "file").touch()
+    run = smsr(
+        *("serve", "--port", "0", "--workers", "0", "--data-dir", tmp_path / "data"),
+        SMSR_STORAGE_URL=(tmp_path / "file").as_uri(),
+    )
+    assert run.returncode == 1, run.stderr
 
 
 @pytest.mark.data

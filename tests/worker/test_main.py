@@ -67,6 +67,20 @@ def test_a_worker_that_ends_when_the_queue_is_empty(
     assert list(settings.scratch.iterdir()) == []
 
 
+def test_wrong_settings_are_told_in_a_line_each() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "worker.main"],
+        env=clean_environment(REDIS_URL="foo://x", SMSR_LEASE_SECONDS="0"),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert run.returncode == 2, run.stderr
+    told = [line.split(": ")[:2] for line in run.stderr.splitlines()]
+    assert told == [["Error", "REDIS_URL"], ["Error", "SMSR_LEASE_SECONDS"]]
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0])
 def test_a_worker_that_is_stopped_while_it_starts(settings: Settings, delay: float) -> None:
     process = subprocess.Popen(
