@@ -150,7 +150,7 @@ def submit(
     """Submit files of 2D tracks to a server.
 
     Files that fail do not hold up the others; they are told at the end, and the exit status says
-    that there were some.
+    that there were some. A name that is no file is wrong usage: nothing is sent then.
     """
     values = preset_and_options(JobOptions, preset, option)
     parse(JobOptions, values)

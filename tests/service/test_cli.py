@@ -303,6 +303,18 @@ def test_submit_many_files_of_which_one_is_bad(
         assert (folder / "report.json").is_file()
 
 
+def test_nothing_is_sent_where_a_name_is_no_file(
+    served: Served, example: Path, tmp_path: Path
+) -> None:
+    of_batch = ("--batch", "misspelt", "--server", served.url)
+    run = smsr("submit", example / "measurements.npy", tmp_path / "nope.npy", *of_batch)
+    assert run.returncode == 2
+    assert "nope.npy" in "".join(run.stderr.replace("│", "").split())
+    assert json.loads(succeeded(smsr("jobs", "list", "--json", *of_batch))) == []
+    told = " ".join(succeeded(smsr("submit", "--help")).replace("│", " ").split())
+    assert "A name that is no file is wrong usage: nothing is sent then." in told
+
+
 def test_a_job_that_fails_is_told_with_its_reason(served: Served, tmp_path: Path) -> None:
     np.save(tmp_path / "constant.npy", np.zeros((20, 30)))
     run = smsr("submit", tmp_path / "constant.npy", "--wait", "--server", served.url)
