@@ -402,11 +402,16 @@ def _bytes(source: MeasurementSource) -> int:
     return 2 * source.frames * source.points * source.dtype.itemsize
 
 
+def unmasked(array: object) -> object:
+    """Return a masked array with NaN where it is masked, and anything else as it is."""
+    if isinstance(array, np.ma.MaskedArray) and np.ma.is_masked(array):
+        return np.where(np.ma.getmaskarray(array), np.nan, np.ma.getdata(array))
+    return array
+
+
 def _as_array(measurements: object) -> NDArray[Any]:
-    if isinstance(measurements, np.ma.MaskedArray) and np.ma.is_masked(measurements):
-        return np.where(np.ma.getmaskarray(measurements), np.nan, np.ma.getdata(measurements))
     try:
-        return np.asarray(measurements)
+        return np.asarray(unmasked(measurements))
     except ValueError as error:
         raise WrongShape(f"The measurements are no array: {error}.") from None
     except (TypeError, RuntimeError) as error:

@@ -24,6 +24,7 @@ from smsr.errors import (
     NotNumeric,
     WrongShape,
 )
+from smsr.measurements import unmasked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -179,7 +180,7 @@ def evaluate(
 
 
 def as_shapes(ground_truth: ArrayLike, frames: int, points: int) -> NDArray[Any]:
-    """View ground truth of any accepted layout as (T, N, 3), without a copy.
+    """View ground truth of any accepted layout as (T, N, 3), without a copy unless it is masked.
 
     Parameters
     ----------
@@ -193,7 +194,7 @@ def as_shapes(ground_truth: ArrayLike, frames: int, points: int) -> NDArray[Any]
         As in `evaluate`.
     """
     try:
-        array = np.asarray(ground_truth)
+        array = np.asarray(unmasked(ground_truth))
     except ValueError as error:  # nested lists of different lengths
         raise WrongShape(f"The ground truth is no array: {error}.") from error
     if array.dtype.kind not in "fiu":

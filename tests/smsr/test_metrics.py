@@ -264,6 +264,14 @@ def test_truth_that_does_not_fit_is_refused(truth: Any, error: type[Exception]) 
         evaluate(truth, perfect(EXAMPLE))
 
 
+def test_masked_truth_is_not_taken_for_values() -> None:
+    truth = np.ma.array(EXAMPLE.ground_truth, mask=False)
+    assert evaluate(truth, perfect(EXAMPLE)).e3d < 1e-9
+    truth[3, 19, 1] = np.ma.masked
+    with pytest.raises(NotFinite, match="frame 3, point 19, axis y"):
+        evaluate(truth, perfect(EXAMPLE))
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_the_place_of_a_value_that_is_not_finite_is_named(
     value: float, monkeypatch: pytest.MonkeyPatch
