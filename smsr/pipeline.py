@@ -269,6 +269,7 @@ def _cameras(reduction: Reduction, options: Options, hook: StageHook) -> CameraE
             options,
             hook,
             points=reduction.sample,
+            tracks=reduction.tracks,
             noise=reduction.noise,
             neglected=reduction.neglected,
         )

@@ -34,6 +34,8 @@ class Reduction:
         The same of noise that was left in, see `smsr.noise.VirtualPoints`.
     sample : ndarray of shape (q, s)
         Some real points as combinations of the virtual ones.
+    tracks : ndarray of shape (2T, s)
+        The same points as they were measured, centred, over `unit`.
     """
 
     points: VirtualPoints
@@ -42,6 +44,7 @@ class Reduction:
     noise: float
     neglected: float
     sample: NDArray[np.float64]
+    tracks: NDArray[np.float64]
 
     @classmethod
     def of(cls, space: RowSpace, options: Options) -> Reduction:
@@ -57,6 +60,7 @@ class Reduction:
             noise=points.noise / space.spread,
             neglected=points.neglected / space.spread,
             sample=points.coordinates @ space.sample,
+            tracks=space.sample / unit,
         )
 
     @property

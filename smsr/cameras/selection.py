@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from smsr import rotations as so3
 from smsr.cameras.free import free_cameras
+from smsr.cameras.halves import FEWEST_POINTS, disagreement_of_halves
 from smsr.cameras.likeliest import with_likelier_cameras
 from smsr.cameras.paper import published_cameras
 from smsr.cameras.rigid import looks_rigid, rigid_cameras
@@ -56,6 +58,15 @@ _VERY_NOISY, _SIMPLE = 0.1, 0.5
 """Noise that was taken off, as a part of the tracks' spread, from which on the likelihood errs less
 than the relaxations do, where these give shapes of a complexity below the second number."""
 
+_UNSURE, _FLAT = 0.4, 0.9
+_APART = math.radians(5.0)
+_MORE_COMPLEX = 0.05
+"""Free cameras of a complexity above the first number may be no surer than they are far from a
+uniform turn, by the third at least. Its shapes must stay below the second, and may be the more
+complex, by the fourth in the logarithm, the less it is apart beside the doubt."""
+
+_HARDLY = 2.0  # times the doubt; from farther off a refinement hardly leads below it
+
 _FRAMES = 400
 _DIRECTIONS = 24
 _SPAN_DIRECTIONS = 18
@@ -68,6 +79,7 @@ def estimate_cameras(
     hook: StageHook = ignore,
     *,
     points: NDArray[np.float64] | None = None,
+    tracks: NDArray[np.float64] | None = None,
     noise: float = 0.0,
     neglected: float = 0.0,
 ) -> CameraEstimate:
@@ -86,6 +98,8 @@ def estimate_cameras(
     points : ndarray of shape (q, s), optional
         Some real points as combinations of the virtual ones, ``left * values``; without them
         nothing can be known to rest.
+    tracks : ndarray of shape (2T, s), optional
+        The same points as they were measured, with their noise.
     noise : float
         Standard deviation of the noise that was taken off, as a part of the tracks' spread; 0 for
         none.
@@ -119,7 +133,7 @@ def estimate_cameras(
     hook = part_of(hook, 0.5, 1.0)
     if options.camera_model == "uniform":
         return with_uniform_path(free, left * values, hook)
-    return with_simple_path(free, left * values, hook, points=points, noise=noise)
+    return with_simple_path(free, left * values, hook, points=points, tracks=tracks, noise=noise)
 
 
 def _trial(free: CameraEstimate, measurements: NDArray[np.float64]) -> Trial:
@@ -153,9 +167,13 @@ def with_simple_path(
     hook: StageHook = ignore,
     *,
     points: NDArray[np.float64] | None = None,
+    tracks: NDArray[np.float64] | None = None,
     noise: float = 0.0,
 ) -> CameraEstimate:
     """Return cameras on a simple path where one explains the free ones.
+
+    A uniform turn is taken, too, where the free ones are so unsure that they do not speak against
+    it.
 
     Otherwise those are returned, turned to the frame in which points rest, if any do. Relaxed ones
     of simple shapes are turned to where they make the tracks likeliest first, where noise is much;
@@ -170,6 +188,7 @@ def with_simple_path(
     hook : callable
         See `smsr.progress.StageHook`.
     points : ndarray of shape (q, s), optional
+    tracks : ndarray of shape (2T, s), optional
         See `estimate_cameras`.
     noise : float
         See `estimate_cameras`. Weak directions of the measurements went with it, and part of what
@@ -179,7 +198,8 @@ def with_simple_path(
     -------
     CameraEstimate
         Its criteria hold, for each path that was judged, the numbers it was judged by:
-        ``uniform_unexplained``, ``uniform_motion_rise``, ``uniform_outside_span`` and the like.
+        ``uniform_unexplained``, ``uniform_motion_rise``, ``uniform_outside_span`` and the like;
+        and ``halves_disagreement``, see `smsr.cameras.halves`, in degrees, where it was asked.
     """
     if len(free.rotations) < FEWEST_FRAMES:
         return free
@@ -204,7 +224,13 @@ def with_simple_path(
         if outside > limit and noise == 0.0 and not trial.flat:
             reasons.append(f"{path} lies outside the span of the tracks by {outside:.1%}")
             continue
-        return _on_path(free, path, turn, verdict, criteria)
+        found = _on_path(free, path, turn, verdict, criteria)
+        if path.model != "axis":
+            return found
+        return _uniform_in_doubt(free, trial, criteria, points, tracks, hook) or found
+    uniform = _uniform_in_doubt(free, trial, criteria, points, tracks, hook)
+    if uniform is not None:
+        return uniform
     simple = free.criteria.get("complexity", 1.0) < _SIMPLE
     if noise >= _VERY_NOISY and simple and free.model == "relaxed":
         still = free = with_likelier_cameras(free, measurements, hook)
@@ -213,6 +239,40 @@ def with_simple_path(
         criteria |= still.criteria
     reason = "; ".join([*reasons, still.reason])
     return dataclasses.replace(still, criteria=criteria, reason=reason)
+
+
+def _uniform_in_doubt(
+    free: CameraEstimate,
+    trial: Trial,
+    criteria: dict[str, float],
+    points: NDArray[np.float64] | None,
+    tracks: NDArray[np.float64] | None,
+    hook: StageHook,
+) -> CameraEstimate | None:
+    """Return cameras on a uniform turn where free ones are no surer than they are far from it."""
+    complexity = free.criteria.get("complexity", 0.0)
+    if points is None or tracks is None or points.shape[1] < FEWEST_POINTS:
+        return None
+    if complexity < _UNSURE or free.model == "shaken":
+        return None
+    doubt = disagreement_of_halves(every_frame(tracks, trial.step), points)
+    criteria["halves_disagreement"] = math.degrees(doubt)
+    path = trial.uniform()
+    if so3.angle_between_paths(trial.rotations, path.turn.rotations) >= _HARDLY * doubt:
+        return None
+    turn, verdict = trial.refine(path, trial.measure(path), hook)
+    apart = so3.angle_between_paths(trial.rotations, turn.rotations)
+    if not _APART <= apart < doubt or complexity >= _FLAT * verdict.simplicity:
+        return None
+    if -math.log(verdict.simplicity) * apart >= _MORE_COMPLEX * doubt:
+        return None
+    verdict = dataclasses.replace(
+        verdict,
+        reason=f"{verdict.reason}; it is {math.degrees(apart):.0f} degrees from the free cameras, "
+        f"and halves of the points disagree by {math.degrees(doubt):.0f} about these",
+    )
+    estimate = _on_path(free, path, turn, verdict, criteria | _numbers(path, verdict))
+    return dataclasses.replace(estimate, simpler=None, simpler_share=0.0)
 
 
 def _at_rest(free: CameraEstimate, trial: Trial, points: NDArray[np.float64]) -> CameraEstimate:
