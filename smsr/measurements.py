@@ -321,7 +321,7 @@ def check_values(source: MeasurementSource) -> None:
     ConstantMeasurements
         All points coincide in every frame.
     """
-    count = 0
+    count = infinite = 0
     first: tuple[int, int] | None = None
     start: NDArray[Any] | None = None
     varies = False
@@ -330,6 +330,7 @@ def check_values(source: MeasurementSource) -> None:
         found = int(np.count_nonzero(bad))
         if found:
             count += found
+            infinite += int(np.count_nonzero(np.isinf(block)))
             row, column = np.unravel_index(int(bad.argmax()), bad.shape)
             here = (int(row), points.start + int(column))
             first = here if first is None else min(first, here)
@@ -337,7 +338,7 @@ def check_values(source: MeasurementSource) -> None:
             start = block[:, :1].copy()
         varies = varies or bool((block != start).any())
     if first is not None:
-        raise _not_finite(first, count, source)
+        raise _not_finite(first, count, infinite, source)
     if not varies:
         raise constant_measurements()
 
@@ -350,15 +351,23 @@ def constant_measurements() -> ConstantMeasurements:
     )
 
 
-def _not_finite(first: tuple[int, int], count: int, source: MeasurementSource) -> NotFinite:
+def _not_finite(
+    first: tuple[int, int], count: int, infinite: int, source: MeasurementSource
+) -> NotFinite:
     row, point = first
     frame, coordinate = row // 2, "uv"[row % 2]
     total = 2 * source.frames * source.points
     entries = "1 entry is" if count == 1 else f"{count} entries are"
+    remedy = (
+        f"Infinite entries ({infinite}) are never taken; where a point is not seen in a frame, "
+        "write NaN, which missing='complete' fills in."
+        if infinite
+        else "With missing='complete', NaN marks points that are not seen in a frame, and they are "
+        "filled in."
+    )
     return NotFinite(
         f"{entries} NaN or infinite, of {total}; the first is coordinate {coordinate} of point "
-        f"{point} in frame {frame} (counting from 0). With missing='complete', NaN marks points "
-        "that are not seen in a frame, and they are filled in.",
+        f"{point} in frame {frame} (counting from 0). {remedy}",
         frame=frame,
         point=point,
         coordinate=coordinate,

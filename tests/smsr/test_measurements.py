@@ -190,6 +190,7 @@ class TestRefusals:
         ) as caught:
             as_source(X)
         assert caught.value.context == {"frame": 2, "point": 17, "coordinate": "v", "count": 3}
+        assert ("never taken" in str(caught.value)) == np.isinf(bad)
 
     def test_not_finite_in_a_later_chunk(self) -> None:
         X = tracks(5, 30)
