@@ -20,7 +20,7 @@ from smsr.cameras.flat import FlatViews, flat_views, steadier
 from smsr.cameras.likeliest import shaken_cameras, with_likelier_cameras
 from smsr.cameras.relaxed import relaxed_cameras
 from smsr.cameras.rigid import part_beyond
-from smsr.cameras.simplicity import complexity, flatness, on_some_frames
+from smsr.cameras.simplicity import FLAT, complexity, flatness, on_some_frames
 from smsr.progress import ignore, part_of
 
 if TYPE_CHECKING:
@@ -70,9 +70,6 @@ _SIMPLE = 0.5
 _HARDLY_DEFORMING = 0.03
 """Complexity, and part of the tracks that three directions leave, below which a camera that shakes
 is no reason to look further: relaxed cameras of simple shapes and nearly rigid ones are right."""
-
-_FLAT = 0.15
-"""Extent of a mean shape across, as a part of its second one, below which it is flat."""
 
 _RELAXATIONS = 0.6  # part of the progress, where others may follow
 
@@ -227,7 +224,7 @@ def _of_flat_shape(
     views = steadier(views)
     problem = on_some_frames(measurements, views.rotations)
     now, flat = problem.complexity(), flatness(problem.shapes.reshape(problem.frames, 3, -1))
-    clearly = _CLEARLY_SIMPLER if flat < _FLAT or noise >= _TOO_NOISY else _FAR_SIMPLER
+    clearly = _CLEARLY_SIMPLER if flat < FLAT or noise >= _TOO_NOISY else _FAR_SIMPLER
     if now >= clearly * before or (now >= _CREDIBLE_FLAT and before <= 1.0):
         return None
     return dataclasses.replace(
@@ -275,7 +272,7 @@ def _of_shaken_camera(
         "steadiness": shaken.steadiness,
         "relaxed_steadiness": shaken.former_steadiness,
     }
-    flat = shaken.flatness < _FLAT
+    flat = shaken.flatness < FLAT
     if flat:
         criteria["frontal_views"] = _frontal_views(FlatViews.of(shaken.rotations, shaken.axes))
     start = "those that see the object as a plane, not from those" if shaken.start > 0 else "those"

@@ -22,7 +22,7 @@ from scipy.linalg import solveh_banded
 
 from smsr import rotations as so3
 from smsr.cameras.estimate import STILL
-from smsr.cameras.simplicity import DIRECTIONS, complexity, flatness, roughly_solved
+from smsr.cameras.simplicity import DIRECTIONS, FLAT, complexity, flatness, roughly_solved
 from smsr.progress import ignore, part_of
 from smsr.shapes.credibility import steadiness
 from smsr.shapes.deformation import (
@@ -61,6 +61,7 @@ _LEAST_CURVATURE = 1e-3  # of the mean one
 
 _JUDGED_FRAMES = 400
 _JUDGING_FLOOR, _JUDGING_ROUNDS, _JUDGING_TOLERANCE = 0.01, 15, 5e-4
+_FAR_AROUND = math.radians(75.0)  # widest angle between views of a camera that turns slowly
 _ROUGH = 0.35  # second over first differences of the tracks, squared
 _SLOWLY = 0.9  # correlation of consecutive shapes
 _STEADY = 0.7  # steadiness of shapes from which on their cameras need no help
@@ -243,7 +244,8 @@ def shaken_cameras(
     ShakenCameras or None
         None where the tracks are smooth, the object is as hasty as the camera, the shapes of the
         given cameras are steady already, or the likeliest ones stand still or give no steadier
-        shapes.
+        shapes; and where the given ones go far around, unless the mean shape is flat, of which they
+        are wrong.
     """
     if not _are_rough(measurements, len(rotations)):
         return None
@@ -261,6 +263,9 @@ def shaken_cameras(
     credible = _CREDIBLE + _CREDIBLE_BY_NOISE * noise
     if best.steadiness < max(before.steadiness + _STEADIER, credible):
         return None
+    flat = flatness(best.shapes)
+    if flat >= FLAT and so3.spread_of_views(rotations) >= _FAR_AROUND:
+        return None
     return ShakenCameras(
         rotations=likeliest,
         start=which,
@@ -270,7 +275,7 @@ def shaken_cameras(
             if judged.log_likelihood > best.log_likelihood - _AS_LIKELY
         ),
         axes=np.linalg.svd(best.shapes.mean(axis=0))[0],
-        flatness=flatness(best.shapes),
+        flatness=flat,
         steadiness=best.steadiness,
         former_steadiness=before.steadiness,
     )

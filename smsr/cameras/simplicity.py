@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 DIRECTIONS = 18
 """Virtual points that cameras are judged by."""
 
+FLAT = 0.15
+"""Flatness of a mean shape below which it is flat, see `flatness`."""
+
 _FRAMES = 200
 
 

@@ -124,10 +124,16 @@ class TestShaken:
     def test_of_two_starts_the_likelier_end_counts(self) -> None:
         measurements, true = tracks()
         rng = np.random.default_rng(0)
-        astray = so3.exp(np.cumsum(0.2 * rng.standard_normal((len(true), 3)), axis=0))
+        astray = so3.exp(np.cumsum(0.03 * rng.standard_normal((len(true), 3)), axis=0))
         found = of_shaken(measurements, astray, turning_by(0.3, true))
         assert found is not None
         assert found.start == 1
+
+    def test_cameras_that_go_far_around_are_no_shake(self) -> None:
+        measurements, true = tracks()
+        angles = np.linspace(-1.0, 1.0, len(true))[:, None] * np.array([0.0, 1.0, 0.0])
+        assert of_shaken(measurements, so3.exp(0.3 * angles) @ true) is not None
+        assert of_shaken(measurements, so3.exp(angles) @ true) is None
 
     def test_right_cameras_need_no_help(self) -> None:
         measurements, true = tracks(seed=1)
