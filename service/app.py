@@ -14,7 +14,7 @@ from fastapi_offline import FastAPIOffline
 from starlette.middleware.cors import CORSMiddleware
 
 import smsr
-from service import documentation, problems
+from service import documentation, problems, query
 from service.access import KEY_SCHEMES, Access, Gate, policy_for
 from service.context import Context
 from service.downloads import OpenResults
@@ -174,9 +174,15 @@ def create_app(settings: Settings, *, address: str | None = None) -> FastAPI:
     documentation.install(app)
     ours = (page, jobs, batches, events, results, uploads, info, health, metrics, problem_pages)
     for routes in ours:
-        closed = routes.router.prefix.startswith("/v1") and routes is not info
-        app.include_router(routes.router, dependencies=KEY_SCHEMES if closed else None)
-        app.include_router(_heads_of(routes.router))
+        versioned = routes.router.prefix.startswith("/v1")
+        checks = [query.CHECKED] if versioned else []
+        keys = KEY_SCHEMES if versioned and routes is not info else ()
+        app.include_router(
+            routes.router,
+            dependencies=[*keys, *checks],
+            responses=query.RESPONSES if versioned else None,
+        )
+        app.include_router(_heads_of(routes.router), dependencies=checks)
     app.add_middleware(Access)
     app.add_middleware(uploads.TusHeaders)
     if settings.cors_origins:

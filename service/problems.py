@@ -134,8 +134,10 @@ _OF_THE_SERVICE = (
         "invalid-request",
         "A parameter of the request is not valid",
         422,
-        "A query parameter or a part of the path has the wrong type or is out of its range.",
-        "The member `errors` says for each parameter where it stands and what is wrong.",
+        "A query parameter or a part of the path has the wrong type or is out of its range, or a "
+        "query parameter is not known or was given twice.",
+        "The member `errors` says for each parameter where it stands and what is wrong; "
+        "`parameters` lists those that are known where one is not.",
     ),
     ProblemType(
         "unauthorized",

@@ -376,6 +376,7 @@ async def _whole_document(request: Request, shared: Context, record: JobRecord) 
         "unsupported-media-type",
         "unknown-part",
         "invalid-setting",
+        "invalid-request",
         "queue-unavailable",
     ),
 )

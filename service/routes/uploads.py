@@ -139,6 +139,7 @@ async def describe_uploads(shared: Shared) -> Response:
             "malformed-digest",
             "digest-mismatch",
             "checksum-mismatch",
+            "invalid-request",
             "empty-file",
             "upload-stalled",
             "queue-unavailable",

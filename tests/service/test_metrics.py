@@ -240,7 +240,7 @@ def test_labels_are_templates_and_their_number_does_not_grow(idle_api: Api) -> N
     assert labels <= templates | {"/openapi.json", "other"}
     assert "/v1/jobs/{job_id}/frames/{frame}.ply" in labels
     for route, method, status, count in (
-        ("/v1/jobs/{job_id}", "HEAD", "404", 5),
+        ("/v1/jobs/{job_id}", "HEAD", "422", 5),
         ("/v1/jobs/{job_id}", "DELETE", "404", 5),
         ("/v1/jobs", "PUT", "405", 5),
         ("other", "GET", "404", 15),

@@ -68,6 +68,15 @@ def test_problems_are_promised_in_their_own_media_type(document: dict[str, Any])
                 assert set(response["content"]) == {MEDIA_TYPE}, (path, method, status)
 
 
+def test_every_route_of_the_api_says_that_its_query_may_be_refused(
+    document: dict[str, Any],
+) -> None:
+    for path, method, operation in operations(document):
+        if path.startswith("/v1"):
+            content = operation["responses"]["422"]["content"][MEDIA_TYPE]
+            assert "invalid-request" in content["examples"], (path, method)
+
+
 def test_a_submission_is_described_with_every_option(
     client: httpx.Client, document: dict[str, Any]
 ) -> None:

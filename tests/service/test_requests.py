@@ -59,7 +59,7 @@ def test_the_access_log(idle_api: Api, tracks: bytes) -> None:
     assert len(tracks) < first["received"] < len(tracks) + 1000
     assert first["sent"] == len(sent.content)
     assert 0 < first["seconds"] < 60
-    assert (second["status"], second["route"]) == (404, "/v1/jobs/{job_id}")
+    assert (second["status"], second["route"]) == (422, "/v1/jobs/{job_id}")
     assert "secret" not in idle_api.log.read_text()
 
 
