@@ -120,8 +120,11 @@ class JobSettings(BaseModel):
         if ttl is not None and isinstance(operator, Settings):
             longest = operator.longest_ttl
             if (ttl or float("inf")) > longest:
+                asked = "" if ttl else "0 would keep the job for ever, which is not allowed here; "
                 raise PydanticCustomError(
-                    "ttl_too_long", "the service keeps jobs for at most {most} s", {"most": longest}
+                    "ttl_too_long",
+                    "{asked}the service keeps jobs for at most {most} s",
+                    {"asked": asked, "most": f"{longest:.15g}"},
                 )
         return ttl
 

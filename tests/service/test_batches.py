@@ -201,6 +201,10 @@ def test_a_change_that_is_none_is_refused(idle_api: Api, tracks: bytes) -> None:
         for ttl in (-1, "60", True, 1e12, 0, [1]):  # 0: for ever, which the settings do not allow
             answer = client.patch(here, json={"ttl": ttl})
             assert problem(answer, "invalid-setting", 422)["setting"] == "ttl"
+        for ttl in (0, 1e12):
+            refused = problem(client.patch(here, json={"ttl": ttl}), "invalid-setting", 422)
+            assert "keeps jobs for at most 2592000 s." in refused["detail"]
+            assert ("0 would keep the job for ever" in refused["detail"]) == (ttl == 0)
         problem(client.patch(here, content=b"{", headers=JSON), "malformed-json", 400)
         long = b'{"ttl": ' + b" " * 200_000 + b"1}"
         problem(client.patch(here, content=long, headers=JSON), "malformed-json", 400)
