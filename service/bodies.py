@@ -31,9 +31,21 @@ class Body:
         Its body is read here, once.
     idle_seconds : float
         Silence after which it is given up.
+
+    Raises
+    ------
+    Problem
+        It has a content coding; none is undone here.
     """
 
     def __init__(self, request: Request, idle_seconds: float) -> None:
+        coding = ", ".join(request.headers.getlist("content-encoding")) or "identity"
+        if coding.lower() != "identity":
+            raise Problem(
+                "unsupported-media-type",
+                f"The body is sent as it is, without Content-Encoding {coding[:60]}.",
+                headers={"Accept-Encoding": "identity"},  # RFC 9110, section 12.5.3
+            )
         self._receive = request.receive
         self._idle = idle_seconds
         self._pending: list[bytes] = []

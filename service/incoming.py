@@ -204,11 +204,12 @@ async def receive_piece(request: Request, shared: Context, upload: Upload, offse
     if announced is not None and announced > upload.length - offset:
         raise _too_long(upload)
     digests = BodyDigests.of(request.headers, tus=True)
+    body = Body(request, limits_of(shared).idle_seconds)
     try:
         await hold(shared, upload)
         token = await to_thread.run_sync(shared.uploads.begin, upload, offset)
         piece = _Piece(shared, upload, offset, token, digests)
-        return await piece.receive(Body(request, limits_of(shared).idle_seconds))
+        return await piece.receive(body)
     except OffsetMismatch:
         raise await _mismatch(shared, upload, offset) from None
     except UploadGone:

@@ -234,7 +234,7 @@ _OF_THE_SERVICE = (
         415,
         "Jobs are submitted as multipart/form-data (RFC 7578) with a boundary, or as JSON that "
         "names finished uploads; a piece of an upload is application/offset+octet-stream, a change "
-        "of a job application/merge-patch+json.",
+        "of a job application/merge-patch+json. No body has a Content-Encoding.",
         "Send the measurement file as the part `measurements`, for instance with "
         "`curl -F measurements=@tracks.npy`.",
     ),

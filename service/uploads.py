@@ -379,13 +379,6 @@ def _boundary(request: Request) -> str:
             f"{kind or 'a body of unknown type'}.",
             headers={"Accept": "multipart/form-data, application/json"},
         )
-    coding = request.headers.get("content-encoding", "identity")
-    if coding.lower() != "identity":
-        raise Problem(
-            "unsupported-media-type",
-            f"The body is sent as it is, without Content-Encoding {coding}.",
-            headers={"Accept-Encoding": "identity"},  # RFC 9110, section 12.5.3
-        )
     boundary: str = parameters.get("boundary", "")
     if not boundary:
         raise Problem("malformed-multipart", "The Content-Type names no boundary.")

@@ -347,12 +347,6 @@ async def put_upload(
     The id has 32 hexadecimal digits, best random ones, and is the client's own: others may use the
     same. The file counts whole or not at all; over a network that breaks, tus is the better way.
     """
-    if request.headers.get("content-encoding", "identity").lower() != "identity":
-        raise Problem(
-            "unsupported-media-type",
-            "The body is sent as it is, without Content-Encoding.",
-            headers={"Accept-Encoding": "identity"},  # RFC 9110, section 12.5.3
-        )
     if "content-range" in request.headers:  # RFC 9110, section 14.5
         raise Problem("malformed-upload", "PUT takes a whole file; pieces are sent by PATCH.")
     disposition = parse_options_header(request.headers.get("content-disposition", ""))[1]

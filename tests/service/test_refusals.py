@@ -23,6 +23,7 @@ from tests.service.conftest import (
     submit,
     wait_for,
 )
+from worker.records import new_job_id
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -242,11 +243,46 @@ def test_bodies_of_another_type(client: httpx.Client, kind: str) -> None:
     problem(answer, "unsupported-media-type", 415)
 
 
-def test_a_compressed_body(client: httpx.Client) -> None:
-    headers = {**MULTIPART, "Content-Encoding": "gzip"}
-    answer = client.post("/v1/jobs", content=gzip.compress(W + END), headers=headers)
-    problem(answer, "unsupported-media-type", 415)
-    assert answer.headers["Accept-Encoding"] == "identity"
+TUS = {"Tus-Resumable": "1.0.0", "Content-Type": "application/offset+octet-stream"}
+JSON = {"Content-Type": "application/json"}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers"),
+    [
+        ("POST", "/v1/jobs", MULTIPART),
+        ("POST", "/v1/jobs", JSON),
+        ("PATCH", "/v1/jobs/{job}", JSON),
+        ("POST", "/v1/uploads", {**TUS, "Upload-Length": "1000"}),
+        ("PATCH", "/v1/uploads/{upload}", {**TUS, "Upload-Offset": "0"}),
+        ("PUT", "/v1/uploads/{new}", {}),
+    ],
+)
+def test_a_compressed_body(
+    idle_api: Api, method: str, path: str, headers: Mapping[str, str]
+) -> None:
+    with idle_api.client() as client:
+        job = submit(client, {"measurements": ("w.npy", npy(GOOD))}).json()["id"]
+        begun = client.post("/v1/uploads", headers={**TUS, "Upload-Length": "1000"})
+        upload = begun.headers["Location"].rpartition("/")[2]
+        before = idle_api.left_behind()
+        url = path.format(job=job, upload=upload, new=new_job_id())
+        for coding in ("gzip", "identity, gzip"):
+            sent = {**headers, "Content-Encoding": coding}
+            answer = client.request(method, url, content=gzip.compress(W + END), headers=sent)
+            document = problem(answer, "unsupported-media-type", 415)
+            assert f"without Content-Encoding {coding}." in document["detail"]
+            assert answer.headers["Accept-Encoding"] == "identity"
+        assert idle_api.left_behind() == before
+        (kept,) = client.get("/v1/uploads").json()["uploads"]
+        assert (kept["id"], kept["offset"]) == (upload, 0)
+
+
+def test_a_body_that_says_it_is_sent_as_it_is(client: httpx.Client) -> None:
+    put = f"/v1/uploads/{new_job_id()}"
+    answer = client.put(put, content=npy(GOOD), headers={"Content-Encoding": "identity"})
+    assert answer.status_code == 201
+    client.delete(put)
 
 
 def test_a_body_without_boundary(client: httpx.Client) -> None:
