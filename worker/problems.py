@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from smsr.errors import InputError, NumericalFailure, SmsrError
+from smsr.errors import AmbiguousArray, InputError, NumericalFailure, SmsrError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,10 +100,15 @@ def problem_document(error: SmsrError, status: int | None = None) -> Mapping[str
     """
     if status is None:
         status = 422 if isinstance(error, _CLIENT_ERRORS) else getattr(error, "status", 500)
+    detail, context = error.detail, error.context
+    if isinstance(error, AmbiguousArray):
+        # The library takes a key with each file; which option of a job that is, it cannot know.
+        option = f"{context['role']}_key"
+        detail, context = f"{detail} The option for it is {option!r}.", context | {"option": option}
     return {
-        **error.context,
+        **context,
         "type": f"/problems/{error.slug}",
         "title": error.title,
         "status": status,
-        "detail": error.detail,
+        "detail": detail,
     }

@@ -119,7 +119,20 @@ BAD = {
     ),
     "mat without numbers": Bad("not-numeric", "run", mat(note="hello"), "w.mat", says="'note'"),
     "empty zip": Bad("unreadable-file", "upload", npz(), "w.npz"),
-    "two candidates": Bad("ambiguous-array", "run", npz(one=GOOD, two=GOOD), "w.npz"),
+    "two candidates": Bad(
+        "ambiguous-array",
+        "run",
+        npz(one=GOOD, two=GOOD),
+        "w.npz",
+        says="'measurements_key'",
+        facts={"option": "measurements_key", "role": "measurements"},
+    ),
+    "two candidates for the faces": Bad(
+        "ambiguous-array",
+        "run",
+        more={"faces": npz(one=np.zeros((5, 3), np.int32), two=np.zeros((6, 3), np.int32))},
+        says="'faces_key'",
+    ),
     "no such key": Bad(
         "array-not-found", "run", npz(W=GOOD), "w.npz", options={"measurements_key": "X"}
     ),
