@@ -7,6 +7,7 @@ from service.context import Shared
 from service.paging import PAGE_SIZE
 from service.schemas import option_document
 from service.waiting import MAX_WAIT_SECONDS
+from smsr.files import SUFFIXES
 from smsr.options import describe
 from smsr_client.documents import Formats, Info, Limits
 from worker.options import JobOptions
@@ -18,7 +19,7 @@ router = APIRouter(prefix="/v1", tags=["service"])
 async def get_info(shared: Shared) -> Info:
     """Return all that a form or a client needs to know before it submits."""
     settings = shared.settings
-    arrays = ["npy", "npz", "mat", "csv", "txt", "csv.gz", "txt.gz"]
+    arrays = [suffix.removeprefix(".") for suffix in SUFFIXES]
     return Info(
         version=smsr.__version__,
         limits=Limits(

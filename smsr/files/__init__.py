@@ -1,7 +1,7 @@
 """Reading measurement, ground-truth and face files; writing results."""
 
 from smsr.files.faces import load_faces
-from smsr.files.formats import HEAD_BYTES, FileFormat, sniff
+from smsr.files.formats import HEAD_BYTES, SUFFIXES, FileFormat, sniff
 from smsr.files.glb import Glb, GlbOptions, write_glb
 from smsr.files.npy import npy_header
 from smsr.files.npz import write_npz
@@ -15,6 +15,7 @@ from smsr.files.xdmf import write_xdmf
 __all__ = [
     "DEFAULT_LIMIT",
     "HEAD_BYTES",
+    "SUFFIXES",
     "Beginning",
     "FileFormat",
     "Glb",

@@ -10,12 +10,40 @@ from smsr.errors import EmptyFile, UnsupportedFormat
 HEAD_BYTES = 64 * 2**10
 """How much of a file's beginning is enough for `sniff` and `check_prefix`."""
 
-READABLE = "NumPy .npy and .npz, MATLAB .mat, .csv, .txt, .csv.gz and .txt.gz"
 
+class FileFormat(enum.StrEnum):
+    """A format that is read here."""
+
+    NPY = "npy"
+    NPZ = "npz"
+    MAT5 = "mat5"
+    HDF5 = "hdf5"
+    TEXT = "text"
+    TEXT_GZ = "text-gz"
+
+
+_SUFFIXES = {
+    FileFormat.NPY: (".npy",),
+    FileFormat.NPZ: (".npz",),
+    FileFormat.MAT5: (".mat",),
+    FileFormat.HDF5: (".h5", ".hdf5"),
+    FileFormat.TEXT: (".csv", ".txt", ".tsv", ".dat"),
+    FileFormat.TEXT_GZ: (".csv.gz", ".txt.gz"),
+}
+"""Customary ends of names; files of MATLAB 7.3 are HDF5 and end in .mat."""
+
+SUFFIXES = tuple(suffix for suffixes in _SUFFIXES.values() for suffix in suffixes)
+"""Ends of the names of files that are read here."""
+
+_READABLE = f"{', '.join(SUFFIXES[:-1])} and {SUFFIXES[-1]}"
+_TEXT_SUFFIXES = frozenset(_SUFFIXES[FileFormat.TEXT])
+_BINARY_SUFFIXES = frozenset(
+    suffix
+    for kind in (FileFormat.NPY, FileFormat.NPZ, FileFormat.HDF5)
+    for suffix in _SUFFIXES[kind]
+)
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _GZIP = b"\x1f\x8b"
-_TEXT_SUFFIXES = frozenset({".csv", ".txt", ".tsv", ".dat"})
-_BINARY_SUFFIXES = frozenset({".npy", ".npz", ".h5", ".hdf5"})
 _TEXT_BYTES = frozenset(bytes(range(32, 127)) + b"\t\n\r")
 _FOREIGN = {
     b"\x80\x03": "a Python pickle, which is never read because it can run code",
@@ -35,17 +63,6 @@ _FOREIGN = {
 }
 
 
-class FileFormat(enum.StrEnum):
-    """A format that is read here."""
-
-    NPY = "npy"
-    NPZ = "npz"
-    MAT5 = "mat5"
-    HDF5 = "hdf5"
-    TEXT = "text"
-    TEXT_GZ = "text-gz"
-
-
 def sniff(head: bytes, name: str) -> FileFormat:
     """Say which format a file has.
 
@@ -61,7 +78,7 @@ def sniff(head: bytes, name: str) -> FileFormat:
     EmptyFile
         No bytes at all.
     UnsupportedFormat
-        None of the formats in `READABLE`.
+        None of the formats of `FileFormat`.
     """
     if not head:
         raise EmptyFile(f"{name} is empty.")
@@ -79,11 +96,11 @@ def sniff(head: bytes, name: str) -> FileFormat:
         return FileFormat.TEXT_GZ
     for magic, what in _FOREIGN.items():
         if head.startswith(magic):
-            raise UnsupportedFormat(f"{name} is {what}. Readable are {READABLE}.")
+            raise UnsupportedFormat(f"{name} is {what}. Readable are {_READABLE}.")
     # MATLAB writes text under .mat with "save -ascii"; the others never hold text.
     if _is_text(head) and PurePath(name).suffix.lower() not in _BINARY_SUFFIXES:
         return FileFormat.TEXT
-    raise UnsupportedFormat(f"{name} is in no format that is read here: {READABLE}.{_hint(name)}")
+    raise UnsupportedFormat(f"{name} is in no format that is read here: {_READABLE}.{_hint(name)}")
 
 
 def _is_text(head: bytes) -> bool:

@@ -47,8 +47,8 @@ def open_array(
     Parameters
     ----------
     path : path
-        A .npy, .npz, .mat (version 5 or 7.3), HDF5, .csv, .txt, .csv.gz or .txt.gz file. The
-        content decides, not the name.
+        A NumPy (.npy, .npz), MATLAB (version 5 or 7.3), HDF5 or text file, the last gzipped or not;
+        `smsr.files.SUFFIXES` has the usual ends of names. The content decides, not the name.
     key : str, optional
         Name of the array in a file of several; ``"GT.shape3D"`` is the field of a MATLAB struct.
     role : {"measurements", "ground_truth", "faces"}

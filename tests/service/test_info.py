@@ -4,6 +4,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import smsr
+from smsr.files import SUFFIXES
 from tests.service.conftest import ARRAY_LIMIT, UPLOAD_LIMIT, Api
 from worker.options import JobOptions
 
@@ -16,7 +17,8 @@ def test_info_tells_version_limits_formats_and_options(client: httpx.Client) -> 
     assert info["version"] == smsr.__version__
     assert info["limits"]["upload_bytes"] == UPLOAD_LIMIT
     assert info["limits"]["array_bytes"] == ARRAY_LIMIT
-    assert {"npy", "npz", "mat", "csv"} <= set(info["formats"]["measurements"])
+    for role in ("measurements", "ground_truth", "faces"):
+        assert [f".{name}" for name in info["formats"][role]] == list(SUFFIXES)
     options = {option["name"]: option for option in info["options"]}
     assert set(options) == {option.name for option in fields(JobOptions)}
     layout = options["layout"]
