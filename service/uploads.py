@@ -102,6 +102,8 @@ async def receive_submission(
     storage: Sink,
     limits: UploadLimits,
     operator: Settings | None = None,
+    *,
+    checked: bool = True,
 ) -> Submission:
     """Read the body of a submission and store its files.
 
@@ -115,6 +117,8 @@ async def receive_submission(
     limits : UploadLimits
     operator : Settings, optional
         Bounds the settings that a job may have.
+    checked : bool
+        Whether files that cannot be used are refused; of others T and N stay unknown.
 
     Raises
     ------
@@ -127,7 +131,7 @@ async def receive_submission(
     announced = request.headers.get("content-length", "")
     if announced.isdecimal() and int(announced) > limits.body_bytes:
         raise limits.too_large()
-    upload = _Upload(request, boundary, job_id, storage, limits, operator)
+    upload = _Upload(request, boundary, job_id, storage, limits, operator, checked=checked)
     try:
         return await upload.receive()
     except BaseException:
@@ -148,6 +152,8 @@ class _Upload:
         storage: Sink,
         limits: UploadLimits,
         operator: Settings | None,
+        *,
+        checked: bool,
     ) -> None:
         self._request = request
         self._job_id = job_id
@@ -155,6 +161,7 @@ class _Upload:
         self._limits = limits
         self._left = limits.bytes
         self._operator = operator
+        self._checking = checked
         self._digests = BodyDigests.of(request.headers)
         self._options: JobOptions | None = None
         self._given: dict[str, str] = {}
@@ -189,7 +196,7 @@ class _Upload:
                 + (f"It has {', '.join(self._inputs)}." if self._inputs else "It has no file."),
             )
         options = self._options or JobOptions()
-        frames, points = self._check_together(options)
+        frames, points = self._check_together(options) if self._checking else (None, None)
         return Submission(options, self._inputs, frames, points, self._settings)
 
     async def _events(self) -> AsyncGenerator[MultipartSegment | bytes | None, None]:
@@ -234,7 +241,9 @@ class _Upload:
     ) -> None:
         """Check the beginning of a file and stream the file to the storage."""
         name = safe_name(segment.filename, role)
-        chunks = self._checked(role, name, self._counted(body))
+        chunks = self._counted(body)
+        if self._checking:
+            chunks = self._checked(role, name, chunks)
         stored = await self._storage.put_stream(upload_key(self._job_id, role), chunks)
         self._inputs[role] = InputFile(
             key=stored.key,

@@ -264,6 +264,7 @@ async def _receive(
             Digests() if repeated else shared.storage,
             limits_of(shared),
             shared.settings,
+            checked=not repeated,  # an unusable file is not that of the first submission either
         )
         fingerprint = fingerprint_of(submission)
         if key is not None and key.bound:

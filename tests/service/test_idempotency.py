@@ -9,12 +9,22 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import httpx
+import numpy as np
 import pytest
 
 from service.idempotency import CLAIM_SECONDS, read_key
 from service.problems import Problem
 from smsr_client import Client
-from tests.service.conftest import Api, api_running, finished, problem, settings_for, wait_for
+from tests.service.conftest import (
+    Api,
+    Files,
+    api_running,
+    finished,
+    npy,
+    problem,
+    settings_for,
+    wait_for,
+)
 from worker.records import IdempotencyKey, JobRecord, KeyTaken, RecordStore, new_job_id
 
 if TYPE_CHECKING:
@@ -66,6 +76,32 @@ def test_another_submission_under_the_same_key(
         problem(send(client, tracks[:-4] + b"\0\0\0\0"), "idempotency-key-reused", 422)
         assert send(client, tracks, key="another", **change).status_code == 201
         assert idle_api.left_behind() > stored
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"measurements": ("w.npy", npy(np.zeros((7, 9))))},
+        {"measurements": ("w.npy", b"\x89PNG\r\n\x1a\n" + bytes(100))},
+        {"measurements": ("w.npy", b"")},
+        {"ground_truth": ("s.npy", npy(np.zeros((3, 5, 3))))},
+        {"faces": ("f.npy", b"no array")},
+    ],
+    ids=["odd rows", "an image", "empty", "truth of other frames", "faces that are none"],
+)
+def test_an_unusable_file_under_the_same_key_is_another_submission(
+    idle_api: Api, tracks: bytes, files: Files
+) -> None:
+    with idle_api.client() as client:
+        assert send(client, tracks).status_code == 201
+        stored = idle_api.left_behind()
+        both: Files = {"measurements": ("w.npy", tracks)} | files
+        answer = client.post("/v1/jobs", files=both, headers={"Idempotency-Key": KEY})
+        problem(answer, "idempotency-key-reused", 422)
+        assert idle_api.left_behind() == stored
+        refused = client.post("/v1/jobs", files=both, headers={"Idempotency-Key": "another"})
+        assert refused.status_code in (415, 422)
+        assert "idempotency" not in refused.json()["type"]
 
 
 def test_a_job_that_is_gone_is_not_made_again(idle_api: Api, tracks: bytes) -> None:
