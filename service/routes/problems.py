@@ -20,12 +20,14 @@ color-scheme:light dark}}dt{{font-weight:600;margin-top:1rem}}dd{{margin:0}}</st
 <body>{body}</body></html>
 """
 
+_NEGOTIATED = {"Vary": "Accept"}
+
 
 def _page(title: str, body: str) -> HTMLResponse:
     """Return a page whose only inline parts, by its policy, are those of the template."""
     policy = policy_of_document(_PAGE.format(title="", body=""))
     text = _PAGE.format(title=title, body=body)
-    return HTMLResponse(text, headers={"Content-Security-Policy": policy, "Vary": "Accept"})
+    return HTMLResponse(text, headers=_NEGOTIATED | {"Content-Security-Policy": policy})
 
 
 def _document(kind: ProblemType, root: str) -> ProblemTypeDocument:
@@ -50,7 +52,8 @@ async def all_problems(request: Request) -> Response:
     root = root_of(request)
     kinds = sorted(CATALOGUE.values(), key=lambda kind: kind.slug)
     if not _wants_html(request):
-        return JSONResponse([_document(kind, root).model_dump() for kind in kinds])
+        documents = [_document(kind, root).model_dump() for kind in kinds]
+        return JSONResponse(documents, headers=_NEGOTIATED)
     entries = "".join(
         f'<dt><a href="{escape(root + kind.uri)}">{escape(kind.slug)}</a> ({kind.status})</dt>'
         f"<dd>{escape(kind.title)}</dd>"
@@ -73,7 +76,7 @@ async def one_problem(request: Request, slug: str) -> Response:
         raise Problem("unknown-problem", "There is no such problem type; see /problems.")
     root = root_of(request)
     if not _wants_html(request):
-        return JSONResponse(_document(kind, root).model_dump())
+        return JSONResponse(_document(kind, root).model_dump(), headers=_NEGOTIATED)
     body = (
         f"<h1>{escape(kind.title)}</h1>"
         f"<dl><dt>Type</dt><dd><code>{escape(root + kind.uri)}</code></dd>"

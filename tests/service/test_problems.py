@@ -52,6 +52,9 @@ def test_problem_pages_are_for_people_and_for_programs(client: httpx.Client) -> 
     assert page.headers["content-type"].startswith("text/html")
     assert "odd number of rows" in page.text
     assert "/problems/odd-row-count" in client.get("/problems", headers=browser).text
+    for path in ("/problems", "/problems/odd-row-count"):
+        for headers in (browser, {"Accept": "application/json"}, {}):
+            assert client.get(path, headers=headers).headers["vary"] == "Accept"
     problem(client.get("/problems/<script>"), "unknown-problem", 404)
 
 
