@@ -1,6 +1,7 @@
 """What the types of problem documents mean, for a person who followed one."""
 
 from html import escape
+from typing import Any
 
 from fastapi import APIRouter, Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
@@ -21,6 +22,9 @@ color-scheme:light dark}}dt{{font-weight:600;margin-top:1rem}}dd{{margin:0}}</st
 """
 
 _NEGOTIATED = {"Vary": "Accept"}
+_FOR_BROWSERS: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/html": {"schema": {"type": "string"}}}}
+}
 
 
 def _page(title: str, body: str) -> HTMLResponse:
@@ -45,7 +49,11 @@ def _wants_html(request: Request) -> bool:
 
 
 @router.get(
-    "", summary="All problem types", response_model=list[ProblemTypeDocument], tags=["problems"]
+    "",
+    summary="All problem types",
+    response_model=list[ProblemTypeDocument],
+    responses=_FOR_BROWSERS,
+    tags=["problems"],
 )
 async def all_problems(request: Request) -> Response:
     """List all types of problem documents: HTML for browsers, JSON otherwise."""
@@ -66,7 +74,7 @@ async def all_problems(request: Request) -> Response:
     "/{slug}",
     summary="A problem type",
     response_model=ProblemTypeDocument,
-    responses=example_responses("unknown-problem"),
+    responses=_FOR_BROWSERS | example_responses("unknown-problem"),
     tags=["problems"],
 )
 async def one_problem(request: Request, slug: str) -> Response:

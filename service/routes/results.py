@@ -29,7 +29,6 @@ RETRY_SECONDS = 2
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 
 _CONDITIONAL = {
-    206: {"description": "The part that Range asks for (RFC 9110, section 14)."},
     304: {"description": "The client has this version already."},
     **example_responses("precondition-failed", "range-not-satisfiable"),
 }
@@ -52,9 +51,22 @@ ImageVertical = Annotated[
 ]
 
 
-def _binary(media_type: str, description: str) -> dict[str, Any]:
-    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
-    return {"description": description, "content": content}
+_BYTES = {"schema": {"type": "string", "format": "binary"}}
+
+
+def _download(content: dict[str, Any], description: str) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI responses of a file, by its media types, and of a part of it."""
+    return {
+        200: {"description": description, "content": content},
+        206: {
+            "description": "The part that Range asks for (RFC 9110, section 14).",
+            "content": dict.fromkeys(content, _BYTES),
+        },
+    }
+
+
+def _binary(media_type: str, description: str) -> dict[int | str, dict[str, Any]]:
+    return _download({media_type: _BYTES}, description)
 
 
 async def _finished(shared: Context, job_id: str) -> JobRecord:
@@ -87,7 +99,7 @@ async def _open(shared: Context, job_id: str) -> ResultFiles:
     "/result.npz",
     summary="Shapes, cameras and translations as one NPZ",
     response_class=StreamingResponse,
-    responses={200: _binary("application/zip", "Read it with numpy.load."), **_PROBLEMS},
+    responses=_binary("application/zip", "Read it with numpy.load.") | _PROBLEMS,
 )
 async def get_npz(shared: Shared, job_id: JobId) -> Download:
     """Return arrays `shapes` (T, N, 3), `cameras` (T, 2, 3), `translations` (T, 2), and `faces`.
@@ -102,7 +114,7 @@ async def get_npz(shared: Shared, job_id: JobId) -> Download:
     "/frames.zip",
     summary="All frames as PLY in one ZIP",
     response_class=StreamingResponse,
-    responses={200: _binary("application/zip", "frame_0000.ply and so on."), **_PROBLEMS},
+    responses=_binary("application/zip", "frame_0000.ply and so on.") | _PROBLEMS,
 )
 async def get_frames(shared: Shared, job_id: JobId) -> Download:
     """Return every frame as a binary PLY, with the faces where faces were sent."""
@@ -115,7 +127,7 @@ async def get_frames(shared: Shared, job_id: JobId) -> Download:
     summary="One frame as PLY",
     response_class=StreamingResponse,
     responses={
-        200: _binary("application/octet-stream", "Binary little-endian PLY."),
+        **_binary("application/octet-stream", "Binary little-endian PLY."),
         **_PROBLEMS,
         **example_responses("unknown-job", "unknown-frame", "invalid-request"),
     },
@@ -139,7 +151,7 @@ async def get_frame(
     summary="The sequence as one animated GLB",
     response_class=StreamingResponse,
     responses={
-        200: _binary("model/gltf-binary", "glTF 2.0 with morph targets, for viewers and Blender."),
+        **_binary("model/gltf-binary", "glTF 2.0 with morph targets, for viewers and Blender."),
         **_PROBLEMS,
         **example_responses("invalid-request", "animation-too-large"),
     },
@@ -171,7 +183,7 @@ async def get_glb(
     "/report.json",
     summary="The whole report of a run",
     responses={
-        200: {"content": {"application/json": {"schema": {"type": "object"}}}},
+        **_download({"application/json": {"schema": {"type": "object"}}}, "The report."),
         **_PROBLEMS,
     },
     response_class=StreamingResponse,
@@ -204,7 +216,7 @@ class ArrayName(StrEnum):
     summary="One array of a result",
     response_class=StreamingResponse,
     responses={
-        200: _binary("application/octet-stream", "Read it with numpy.load."),
+        **_binary("application/octet-stream", "Read it with numpy.load."),
         307: {"description": "To a signed address of the store, where the operator wants that."},
         **_PROBLEMS,
         **example_responses("unknown-job", "unknown-file", "invalid-request"),
@@ -236,7 +248,7 @@ async def get_array(request: Request, shared: Shared, job_id: JobId, array: Arra
     summary="A file as it was sent",
     response_class=StreamingResponse,
     responses={
-        200: _binary("application/octet-stream", "The bytes that were uploaded."),
+        **_binary("application/octet-stream", "The bytes that were uploaded."),
         **_CONDITIONAL,
         **example_responses(
             "unknown-job", "unknown-file", "queue-unavailable", "storage-unavailable"
@@ -275,13 +287,9 @@ async def get_input(
     summary="A figure of the run",
     response_class=StreamingResponse,
     responses={
-        200: {
-            "description": "The picture.",
-            "content": {
-                "image/png": {"schema": {"type": "string", "format": "binary"}},
-                "image/svg+xml": {"schema": {"type": "string"}},
-            },
-        },
+        **_download(
+            {"image/png": _BYTES, "image/svg+xml": {"schema": {"type": "string"}}}, "The picture."
+        ),
         **_PROBLEMS,
         **example_responses(
             "unknown-job", "nothing-to-draw", "invalid-request", "figures-unavailable"

@@ -77,6 +77,29 @@ def test_every_route_of_the_api_says_that_its_query_may_be_refused(
             assert "invalid-request" in content["examples"], (path, method)
 
 
+def test_a_part_of_a_file_is_of_the_type_of_the_file(document: dict[str, Any]) -> None:
+    found = 0
+    for path, method, operation in operations(document):
+        if "206" in operation["responses"]:
+            found += 1
+            whole, part = (operation["responses"][status]["content"] for status in ("200", "206"))
+            assert set(part) == set(whole), (path, method)
+    assert found >= 8
+
+
+def test_pages_about_problems_are_promised_in_both_types(
+    client: httpx.Client, document: dict[str, Any]
+) -> None:
+    for path in ("/problems", "/problems/{slug}"):
+        content = document["paths"][path]["get"]["responses"]["200"]["content"]
+        for accept in ("text/html", "application/json"):
+            asked = path.replace("{slug}", "not-found")
+            answer = client.get(asked, headers={"Accept": accept})
+            assert answer.headers["content-type"].partition(";")[0] == accept
+            assert accept in content
+        assert len(content) == 2
+
+
 def test_a_submission_is_described_with_every_option(
     client: httpx.Client, document: dict[str, Any]
 ) -> None:
