@@ -202,10 +202,9 @@ _OF_THE_SERVICE = (
         "unknown-file",
         "The job has no such file",
         404,
-        "The result has no such array, or no such file was sent with the job, or it is kept no "
-        "longer.",
-        "The member `inputs` of the job lists what was sent; results have faces where faces were "
-        "sent.",
+        "There is no array or figure of this name, or no such file was sent with the job, or it is "
+        "kept no longer.",
+        "The member `files` lists such files; results have faces where faces were sent.",
     ),
     ProblemType(
         "precondition-failed",

@@ -1,6 +1,6 @@
 """Downloading results."""
 
-from enum import StrEnum
+from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Annotated, Any
 
@@ -12,19 +12,22 @@ from service.conditional import Validators
 from service.content import stored_content
 from service.context import Context, JobId, Shared
 from service.downloads import (
+    ARRAYS,
     Download,
     ResultFiles,
     result_validators,
     safe_media_type,
 )
 from service.problems import Problem, example_responses
-from smsr.figures import FigureFormat, FigureName
+from smsr import figures
 from smsr.files.glb import GlbOptions, ImageV
 from worker.records import JobRecord
 from worker.storage import ObjectMissing
 
 RETRY_SECONDS = 2
 """What ``Retry-After`` says while a job is queued or runs."""
+
+_SHOWN = 60
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 
@@ -202,13 +205,17 @@ async def get_report(shared: Shared, job_id: JobId) -> Download:
     )
 
 
-class ArrayName(StrEnum):
-    """The arrays of a result."""
+def _name(names: Sequence[str], description: str) -> Any:
+    """Return the parameter of a file's name, one of some; of others it is said that none exists."""
+    return Path(description=description, json_schema_extra={"enum": list(names)})
 
-    SHAPES = "shapes"
-    CAMERAS = "cameras"
-    TRANSLATIONS = "translations"
-    FACES = "faces"
+
+def _no_file(name: str, there: Sequence[str]) -> Problem:
+    return Problem(
+        "unknown-file",
+        f"The job has no {name[:_SHOWN]!r}. Such files are {', '.join(there)}.",
+        files=list(there),
+    )
 
 
 @router.get(
@@ -222,17 +229,22 @@ class ArrayName(StrEnum):
         **example_responses("unknown-job", "unknown-file", "invalid-request"),
     },
 )
-async def get_array(request: Request, shared: Shared, job_id: JobId, array: ArrayName) -> Response:
+async def get_array(
+    request: Request,
+    shared: Shared,
+    job_id: JobId,
+    array: Annotated[str, _name([file.removesuffix(".npy") for file in ARRAYS], "Its name.")],
+) -> Response:
     """Return an array as an NPY file, or the range of its bytes that is asked for.
 
     `shapes` is float32 (T, N, 3), `cameras` float64 (T, 2, 3), `translations` float64 (T, 2) and
     `faces`, where some were sent, (F, 3). A reader that knows the header can fetch single frames.
     """
     files = await _open(shared, job_id)
-    file = f"{array}.npy"
-    found = files.arrays().get(file)
+    file, there = f"{array}.npy", files.arrays()
+    found = there.get(file)
     if found is None:
-        raise Problem("unknown-file", "No faces were sent with the job, so its result has none.")
+        raise _no_file(file, list(there))
     seconds = shared.settings.presigned_links_seconds
     # A signature is for one method, and HEAD moves no bytes.
     if seconds is not None and request.method == "GET":
@@ -267,8 +279,7 @@ async def get_input(
     record = await shared.record(job_id)
     file = record.inputs.get(role)
     if file is None:
-        sent = ", ".join(record.inputs)
-        raise Problem("unknown-file", f"The job was not sent with a file {role!r}; it has {sent}.")
+        raise _no_file(f"inputs/{role}", [f"inputs/{sent}" for sent in record.inputs])
     try:
         size = await to_thread.run_sync(shared.storage.size, file.key)
     except ObjectMissing:
@@ -292,15 +303,19 @@ async def get_input(
         ),
         **_PROBLEMS,
         **example_responses(
-            "unknown-job", "nothing-to-draw", "invalid-request", "figures-unavailable"
+            "unknown-job",
+            "unknown-file",
+            "nothing-to-draw",
+            "invalid-request",
+            "figures-unavailable",
         ),
     },
 )
 async def get_figure(
     shared: Shared,
     job_id: JobId,
-    name: FigureName,
-    form: FigureFormat,
+    name: Annotated[str, _name(figures.NAMES, "What it shows.")],
+    form: Annotated[str, _name(figures.FORMATS, "Its format.")],
     image_v: ImageVertical = "auto",
 ) -> Download:
     """Return a picture of the residuals, the singular values, the error, the shapes or the cameras.
@@ -308,6 +323,9 @@ async def get_figure(
     `error` is there where ground truth was sent. Pictures read in black and white.
     """
     files = await _open(shared, job_id)
+    if name not in figures.NAMES or form not in figures.FORMATS:
+        there = [f"figures/{name}.{form}" for name in figures.NAMES for form in figures.FORMATS]
+        raise _no_file(f"figures/{name}.{form}", there)
     return files.figure(
         name, form, image_v, name=f"smsr-{job_id}-{name}.{form}", drawers=shared.results.drawers
     )

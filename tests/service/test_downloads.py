@@ -72,8 +72,10 @@ def test_arrays_are_those_of_the_npz(client: httpx.Client, job: dict[str, Any]) 
 def test_a_result_without_faces_has_no_file_of_them(client: httpx.Client, tracks: bytes) -> None:
     bare = finished(client, submit(client, {"measurements": ("w.npy", tracks)}))
     assert bare["links"]["faces"] is None
-    problem(client.get(of(bare, "faces.npy")), "unknown-file", 404)
-    problem(client.get(of(bare, "weights.npy")), "invalid-request", 422)
+    for file in ("faces.npy", "weights.npy"):
+        document = problem(client.get(of(bare, file)), "unknown-file", 404)
+        assert document["files"] == ["shapes.npy", "cameras.npy", "translations.npy"]
+        assert f"no {file!r}. Such files are shapes.npy, " in document["detail"]
 
 
 def test_one_frame_is_a_range_of_the_shapes(client: httpx.Client, job: dict[str, Any]) -> None:
@@ -154,7 +156,9 @@ def test_inputs_come_back_as_they_were_sent(client: httpx.Client, tracks: bytes)
     )
     digest = base64.b64encode(hashlib.sha256(tracks).digest()).decode()
     assert answer.headers["repr-digest"] == f"sha-256=:{digest}:"
-    problem(client.get(of(sent, "inputs/faces")), "unknown-file", 404)
+    for role in ("faces", "nope"):
+        document = problem(client.get(of(sent, f"inputs/{role}")), "unknown-file", 404)
+        assert document["files"] == ["inputs/measurements"]
     problem(client.get(of(sent, "inputs/..%2F..")), "not-found", 404)
 
 

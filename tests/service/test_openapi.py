@@ -9,6 +9,7 @@ from openapi_spec_validator import OpenAPIV31SpecValidator
 
 from service.app import create_app
 from service.problems import CATALOGUE, MEDIA_TYPE
+from smsr import figures
 from smsr_client.documents import Job
 from worker.settings import Settings
 
@@ -85,6 +86,18 @@ def test_a_part_of_a_file_is_of_the_type_of_the_file(document: dict[str, Any]) -
             whole, part = (operation["responses"][status]["content"] for status in ("200", "206"))
             assert set(part) == set(whole), (path, method)
     assert found >= 8
+
+
+def test_names_of_files_are_listed(document: dict[str, Any]) -> None:
+    listed = {
+        (path.rpartition("/")[2], parameter["name"]): parameter["schema"].get("enum")
+        for path, _, operation in operations(document)
+        for parameter in operation.get("parameters", ())
+        if parameter["in"] == "path"
+    }
+    assert listed["{array}.npy", "array"] == ["shapes", "cameras", "translations", "faces"]
+    assert listed["{name}.{form}", "name"] == list(figures.NAMES)
+    assert listed["{name}.{form}", "form"] == list(figures.FORMATS)
 
 
 def test_pages_about_problems_are_promised_in_both_types(

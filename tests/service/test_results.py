@@ -220,8 +220,10 @@ def test_figures_are_those_of_the_result(
     )
     assert clouds != meshes
     problem(client.get(f"/v1/jobs/{job['id']}/figures/error.png"), "nothing-to-draw", 404)
-    for path in ("figures/none.png", "figures/error.gif"):
-        problem(client.get(f"/v1/jobs/{job['id']}/{path}"), "invalid-request", 422)
+    for path in ("figures/none.png", "figures/error.gif", "figures/error.svg.png"):
+        document = problem(client.get(f"/v1/jobs/{job['id']}/{path}"), "unknown-file", 404)
+        assert f"no '{path}'" in document["detail"]
+        assert {"figures/shapes.png", "figures/shapes.svg"} < set(document["files"])
 
 
 def test_the_error_is_drawn_where_there_is_truth(
