@@ -33,6 +33,7 @@ FigureName = Literal["convergence", "singular-values", "error", "shapes", "camer
 FigureFormat = Literal["png", "svg"]
 
 NAMES: tuple[FigureName, ...] = get_args(FigureName)
+FORMATS: tuple[FigureFormat, ...] = get_args(FigureFormat)
 
 MOST_POINTS = 20_000
 """Points of a frame that are drawn at most."""
