@@ -100,7 +100,8 @@ class Api:
             storage = self.storage()
             prefixes = ("uploads/", "incoming/", "results/")
             return {item.key for prefix in prefixes for item in storage.list_prefix(prefix)}
-        return {str(path) for path in self.objects.rglob("*") if path.is_file()}
+        # Unlike Path.rglob, it passes over folders that go while it looks.
+        return {f"{folder}/{name}" for folder, _, names in os.walk(self.objects) for name in names}
 
     def left_behind(self) -> set[str]:
         """Names of all stored files and of all Redis keys that are a job's."""
