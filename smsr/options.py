@@ -297,7 +297,9 @@ def parse(cls: type[O], values: Mapping[str, object]) -> O:
 
 
 def _check(what: OptionDescription, value: object) -> int | float | bool | str | None:
-    if isinstance(value, np.generic):
+    if isinstance(value, np.integer | np.floating | np.bool_ | np.str_) and not isinstance(
+        value, np.timedelta64
+    ):
         value = value.item()
     if value is None and what.nullable:
         return None

@@ -182,7 +182,7 @@ def solve(space: RowSpace, options: Options, clock: _Clock) -> Solution:
     """
     if options.noise is not None and options.noise >= space.spread:
         raise InvalidOption(
-            f"Option 'noise' must be below {space.spread:.3g}, the spread of the points of a frame "
+            f"Option 'noise' must be below {space.spread:g}, the spread of the points of a frame "
             f"about their mean, of which it is a part; it was {options.noise:g}. Give the standard "
             "deviation in the units of the tracks, or null to have it estimated.",
             option="noise",

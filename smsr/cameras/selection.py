@@ -253,7 +253,8 @@ def _uniform_in_doubt(
     complexity = free.criteria.get("complexity", 0.0)
     if points is None or tracks is None or points.shape[1] < FEWEST_POINTS:
         return None
-    if complexity < _UNSURE or free.model == "shaken":
+    # Halves have relaxed cameras, which tell nothing of how sure others are.
+    if complexity < _UNSURE or free.model != "relaxed":
         return None
     doubt = disagreement_of_halves(every_frame(tracks, trial.step), points)
     criteria["halves_disagreement"] = math.degrees(doubt)

@@ -264,17 +264,17 @@ class Trial:
         unexplained = self._unexplained(path)
         tiny = np.finfo(float).tiny
         problem = self._solve(path.turn.every(self.step).rotations)
-        nuclear = float(problem.spectrum().sum())
-        motion = max(problem.motion(), _LEAST_MOTION * nuclear, tiny)
+        nuclear, motion = _nuclear_and_motion(problem)
+        free_nuclear, free_motion = _nuclear_and_motion(self._free)
         gain = max(0.0, math.log(max(problem.image_motion(), tiny) / motion))
-        rise = math.log(motion / max(self._free.motion(), tiny))
+        rise = math.log(motion / free_motion)
         return Verdict(
             unexplained,
             f"leaves {unexplained:.1%} of the rotation unexplained and changes the motion of the "
             f"object by {math.expm1(rise):+.0%}",
             rise,
             _MOTION_WEIGHT * gain * nuclear / motion,
-            float(self._free.spectrum().sum()) / max(nuclear, tiny),
+            free_nuclear / max(nuclear, tiny),
         )
 
     def refine(
@@ -307,3 +307,9 @@ class Trial:
         problem.start_from_least_motion()
         problem.minimise(120, 1e-4)
         return problem
+
+
+def _nuclear_and_motion(problem: DepthProblem) -> tuple[float, float]:
+    """Return the nuclear norm of shapes and their motion, above what is rounding."""
+    nuclear = float(problem.spectrum().sum())
+    return nuclear, max(problem.motion(), _LEAST_MOTION * nuclear, np.finfo(float).tiny)

@@ -10,7 +10,6 @@ import pytest
 from smsr import evaluate, reconstruct
 from smsr.benchmark.camera_paths import PATHS, noisy_tracks, sway
 from smsr.cameras.halves import disagreement_of_halves
-from smsr.synthetic import make_low_rank
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -57,6 +56,12 @@ class TestDisagreement:
         turned = 1e3 * (turn @ tracks.reshape(FRAMES, 2, POINTS)).reshape(tracks.shape)[:, order]
         assert halves(turned) == pytest.approx(halves(tracks), rel=1e-6)
 
+    def test_points_that_coincide_say_nothing(self) -> None:
+        tracks = np.tile(np.random.default_rng(0).standard_normal((28, 1)), (1, 12))
+        tracks[:, 0] += 1.0
+        assert halves(tracks) == 0.0
+        assert np.isfinite(reconstruct(tracks).shapes).all()
+
 
 class TestUniformTurn:
     @pytest.mark.parametrize("seed", [1, 2])
@@ -77,6 +82,10 @@ class TestUniformTurn:
         tracks = seen("slow pan", 0.05, 1)[0][:, :11]
         assert "halves_disagreement" not in reconstruct(tracks).diagnostics.camera_criteria
 
-    def test_simple_shapes_are_not_doubted(self) -> None:
-        result = reconstruct(make_low_rank(60, 40, 1, noise=0.02, seed=3).measurements)
+    def test_simple_shapes_are_not_doubted(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        tracks = seen("smooth", 0.0, 3)[0]
+        result = reconstruct(tracks)
+        assert result.diagnostics.camera_model == "relaxed"
         assert "halves_disagreement" not in result.diagnostics.camera_criteria
+        monkeypatch.setattr("smsr.cameras.selection._UNSURE", 0.0)
+        assert "halves_disagreement" in reconstruct(tracks).diagnostics.camera_criteria

@@ -140,7 +140,7 @@ class TestReconstruction:
         example = make_low_rank(20, 12, 1, seed=3)
         tracks = example.measurements
         spread = (tracks - tracks.mean(axis=1, keepdims=True)).std()
-        with pytest.raises(InvalidOption, match=f"below {spread:.3g}"):
+        with pytest.raises(InvalidOption, match=f"below {spread:g}"):
             reconstruct(tracks, noise=noise * spread)
 
     def test_cameras_see_the_shapes_without_the_noise(self) -> None:

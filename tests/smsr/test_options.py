@@ -63,6 +63,7 @@ def test_parse_takes_numbers_of_numpy() -> None:
         ("ratio", float("nan"), "type number"),
         ("ratio", -0.1, "at least 0;"),
         ("count", np.float64(3.0), "type integer"),
+        ("count", np.timedelta64(3), "type integer"),
         ("name", 5, "type string or null"),
         ("mode", "slow", "one of fast, exact"),
         ("flag", 1, "type boolean"),
