@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ from fastapi.dependencies.utils import get_flat_params
 from fastapi.params import Query
 
 from service.problems import Problem, example_responses
+from smsr.errors import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -61,8 +61,6 @@ def _wrong(given: Sequence[str], known: Sequence[str]) -> Iterator[tuple[str, st
     for name in dict.fromkeys(given):
         shown = name[:_NAME_LENGTH]
         if name not in known:
-            near = difflib.get_close_matches(shown, known, n=1)
-            hint = f" Did you mean {near[0]!r}?" if near else ""
-            yield shown, f"There is no parameter {shown!r}.{hint}"
+            yield shown, f"There is no parameter {shown!r}.{did_you_mean(shown, known)}"
         elif given.count(name) > 1:
             yield shown, f"The parameter {name!r} takes one value and was given several."

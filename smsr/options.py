@@ -7,7 +7,6 @@ an option is written twice.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import types
 import typing
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
-from smsr.errors import InvalidOption, UnknownOption
+from smsr.errors import InvalidOption, UnknownOption, did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -285,10 +284,9 @@ def parse(cls: type[O], values: Mapping[str, object]) -> O:
     checked: dict[str, Any] = {}
     for name, value in values.items():
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f" Did you mean {near[0]!r}?" if near else ""
             raise UnknownOption(
-                f"There is no option {name!r}.{hint} Options are {', '.join(known)}.",
+                f"There is no option {name!r}.{did_you_mean(name, known)} "
+                f"Options are {', '.join(known)}.",
                 option=name,
                 options=list(known),
             )

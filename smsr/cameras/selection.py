@@ -157,8 +157,7 @@ def with_uniform_path(
     path = trial.uniform()
     verdict = trial.measure(path)
     turn, verdict = trial.refine(path, verdict, hook)
-    estimate = _on_path(free, path, turn, verdict, dict(free.criteria) | _numbers(path, verdict))
-    return dataclasses.replace(estimate, simpler=None, simpler_share=0.0)
+    return _on_path_alone(free, path, turn, verdict, free.criteria)
 
 
 def with_simple_path(
@@ -272,8 +271,7 @@ def _uniform_in_doubt(
         reason=f"{verdict.reason}; it is {math.degrees(apart):.0f} degrees from the free cameras, "
         f"and halves of the points disagree by {math.degrees(doubt):.0f} about these",
     )
-    estimate = _on_path(free, path, turn, verdict, criteria | _numbers(path, verdict))
-    return dataclasses.replace(estimate, simpler=None, simpler_share=0.0)
+    return _on_path_alone(free, path, turn, verdict, criteria)
 
 
 def _at_rest(free: CameraEstimate, trial: Trial, points: NDArray[np.float64]) -> CameraEstimate:
@@ -327,6 +325,18 @@ def _on_path(
         adjustable=adjustable,
         reason=f"{path}, {speed:.2f} degrees a frame, {verdict.reason}; {free.reason}",
     )
+
+
+def _on_path_alone(
+    free: CameraEstimate,
+    path: Path,
+    turn: Turn,
+    verdict: Verdict,
+    criteria: Mapping[str, float],
+) -> CameraEstimate:
+    """Return the cameras of an accepted path, without any depths that the free ones see."""
+    estimate = _on_path(free, path, turn, verdict, dict(criteria) | _numbers(path, verdict))
+    return dataclasses.replace(estimate, simpler=None, simpler_share=0.0)
 
 
 def part_outside_span(measurements: NDArray[np.float64], rotations: NDArray[np.float64]) -> float:

@@ -179,6 +179,7 @@ class Trial:
         self.step = step
         self.flat = flat
         self._free = self._solve(rotations[::step])
+        self._free_nuclear, self._free_motion = _nuclear_and_motion(self._free)
 
     def come_to_rest(self, points: NDArray[np.float64]) -> tuple[float, float]:
         """Turn the free cameras to the frame in which points rest, as far as some do.
@@ -265,16 +266,15 @@ class Trial:
         tiny = np.finfo(float).tiny
         problem = self._solve(path.turn.every(self.step).rotations)
         nuclear, motion = _nuclear_and_motion(problem)
-        free_nuclear, free_motion = _nuclear_and_motion(self._free)
         gain = max(0.0, math.log(max(problem.image_motion(), tiny) / motion))
-        rise = math.log(motion / free_motion)
+        rise = math.log(motion / self._free_motion)
         return Verdict(
             unexplained,
             f"leaves {unexplained:.1%} of the rotation unexplained and changes the motion of the "
             f"object by {math.expm1(rise):+.0%}",
             rise,
             _MOTION_WEIGHT * gain * nuclear / motion,
-            free_nuclear / max(nuclear, tiny),
+            self._free_nuclear / max(nuclear, tiny),
         )
 
     def refine(
